@@ -1,0 +1,70 @@
+"""Lines of a plane: homogeneous and polar form, transfer by a homography; section II.A and eq. (9)."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sofjax.geometry.angles import safe_arctan2, safe_divide, safe_norm, wrap_axial
+
+
+class PolarLine(eqx.Module):
+    """l = (rho, theta): the line n·x = rho with n = (-sin theta, cos theta).
+
+    rho is signed; (rho, theta) and (-rho, theta + pi) are one line.
+    """
+
+    rho: Float[Array, "*batch"]  # distance from the origin, in the unit of the plane
+    theta: Float[Array, "*batch"]  # angle of the line to the first axis, radians
+
+
+def line_through(
+    x1: Float[Array, "2"], x2: Float[Array, "2"]
+) -> Float[Array, "3"]:
+    """l = x1 × x2, the homogeneous line through two points; zero if the points coincide."""
+    return jnp.cross(jnp.append(x1, 1.0), jnp.append(x2, 1.0))
+
+
+def cofactor(H: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """det(H) H^-T, which transfers lines without dividing and exists for a singular H too."""
+    h1, h2, h3 = H.T
+    return jnp.stack([jnp.cross(h2, h3), jnp.cross(h3, h1), jnp.cross(h1, h2)], axis=1)
+
+
+def transfer_line(H: Float[Array, "3 3"], line: Float[Array, "3"]) -> Float[Array, "3"]:
+    """l' ~ H^-T l for points that go by x' ~ H x; up to scale, as every homogeneous line."""
+    return cofactor(H) @ line
+
+
+def polar(line: Float[Array, "3"]) -> PolarLine:
+    """Polar form of a homogeneous line; rho = 0, theta = 0 for the line at infinity."""
+    a, b, c = line
+    return PolarLine(rho=safe_divide(-c, safe_norm(line[:2])), theta=safe_arctan2(-a, b))
+
+
+def polar_through(endpoints: Float[Array, "2 2"]) -> PolarLine:
+    """Polar form of the line through two points, about the origin of their frame.
+
+    Equal to `polar(line_through(x1, x2))`, without the cancellation of x1 × x2 in float32
+    when the points are far from the origin and near to each other.
+    """
+    x1, x2 = endpoints
+    d = x2 - x1
+    middle = (x1 + x2) / 2
+    normal = jnp.stack([-d[1], d[0]])
+    return PolarLine(rho=safe_divide(normal @ middle, safe_norm(d)), theta=safe_arctan2(d[1], d[0]))
+
+
+def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "2"]:
+    """(rho_a - rho_b, theta_a - theta_b) of two lines, whichever way each is directed.
+
+    Differs from the paper: eq. (9) subtracts the numbers as they stand, which jump by the
+    sign of rho where a line is named from its other side. Here the normal of `b` is turned to
+    that of `a`, and the angle is axial, in [-pi/2, pi/2].
+    """
+    aligned = jnp.where(jnp.cos(a.theta - b.theta) < 0, -1, 1)
+    return jnp.stack([a.rho - aligned * b.rho, wrap_axial(a.theta - b.theta)])
+
+
+def line_point_distance(line: Float[Array, "3"], point: Float[Array, "2"]) -> Float[Array, ""]:
+    """Signed distance of a point from a homogeneous line, in the unit of the plane."""
+    return safe_divide(line[:2] @ point + line[2], safe_norm(line[:2]))

@@ -1,0 +1,58 @@
+"""Segments: padded arrays of end points with a mask; section II.A."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sofjax.geometry.angles import safe_divide, safe_norm
+from sofjax.geometry.se2 import SE2
+
+
+class Segments(eqx.Module):
+    """Segments of one frame, named by the variable: `_image` in pixels, `_robot`, `_world` in metres.
+
+    Where `valid` is false the end points are padding: finite, and without meaning.
+    """
+
+    endpoints: Float[Array, "*batch 2 2"]
+    valid: Bool[Array, "*batch"]
+
+    def transform(self, T_a_b: SE2) -> "Segments":
+        """Segments of frame b in frame a."""
+        return Segments(T_a_b.apply(self.endpoints), self.valid)
+
+    @property
+    def length(self) -> Float[Array, "*batch"]:
+        return safe_norm(self.endpoints[..., 1, :] - self.endpoints[..., 0, :])
+
+
+def overlap(first: Float[Array, "2 2"], second: Float[Array, "2 2"]) -> Float[Array, ""]:
+    """Length that two segments share along the direction of the second; text below eq. (9).
+
+    Negative is the gap between them; zero if the second has no length.
+    """
+    d = second[1] - second[0]
+    unit = safe_divide(d, safe_norm(d))
+    a, b = first @ unit, second @ unit
+    return jnp.minimum(a.max(), b.max()) - jnp.maximum(a.min(), b.min())
+
+
+def clip(
+    segment: Float[Array, "2 2"], above: Float[Array, "2"]
+) -> tuple[Float[Array, "2 2"], Bool[Array, ""]]:
+    """The part of a segment on which an affine function is not negative.
+
+    **Arguments:**
+    - `segment`: two end points.
+    - `above`: the function's values at them.
+
+    **Returns:** the part, in the same direction, and whether it has any length. Where it has
+    none the segment comes back as it was.
+    """
+    f0, f1 = above
+    cross = jnp.clip(safe_divide(f0, f0 - f1), 0, 1)
+    zero = segment[0] + cross * (segment[1] - segment[0])
+    some = (f0 > 0) | (f1 > 0)
+    first = jnp.where(some & (f0 < 0), zero, segment[0])
+    second = jnp.where(some & (f1 < 0), zero, segment[1])
+    return jnp.stack([first, second]), some

@@ -1,0 +1,18 @@
+"""What the robot gives the filter at each image."""
+
+import equinox as eqx
+from jaxtyping import Array, Int
+
+from sofjax.geometry.se2 import SE2
+from sofjax.geometry.segments import Segments
+
+
+class Observation(eqx.Module):
+    """One image's segments and the odometer's motion since the image before.
+
+    A log of T images is one `Observation` whose leaves carry a leading axis T.
+    """
+
+    segments_image: Segments  # capacity M, pixels of the undistorted image
+    motion: SE2  # T_previous_current as the odometer reads it; the identity at the first image
+    overflow: Int[Array, "*batch"]  # segments that were detected and did not fit into M
