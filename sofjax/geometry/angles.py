@@ -14,11 +14,15 @@ def wrap_axial(angle: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return angle - jnp.pi * jnp.round(angle / jnp.pi)
 
 
+def safe_sqrt(value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Square root, and zero (with zero gradient) where the value is not positive."""
+    positive = value > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1)), 0)
+
+
 def safe_norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     """Euclidean norm; its gradient at the zero vector is zero where `jnp.linalg.norm` gives NaN."""
-    squared = jnp.sum(vector**2, axis=-1)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+    return safe_sqrt(jnp.sum(vector**2, axis=-1))
 
 
 def safe_divide(

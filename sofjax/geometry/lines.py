@@ -4,7 +4,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sofjax.geometry.angles import safe_arctan2, safe_divide, safe_norm, wrap_axial
+from sofjax.geometry.angles import safe_arctan2, safe_divide, safe_norm
+from sofjax.geometry.se2 import SE2
 
 
 class PolarLine(eqx.Module):
@@ -61,8 +62,26 @@ def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "2"]:
     sign of rho where a line is named from its other side. Here the normal of `b` is turned to
     that of `a`, and the angle is axial, in [-pi/2, pi/2].
     """
-    aligned = jnp.where(jnp.cos(a.theta - b.theta) < 0, -1, 1)
-    return jnp.stack([a.rho - aligned * b.rho, wrap_axial(a.theta - b.theta)])
+    turn = a.theta - b.theta
+    half_turns = jnp.round(turn / jnp.pi)  # odd: the two are named from opposite sides
+    aligned = 1 - 2 * jnp.abs(jnp.remainder(half_turns, 2))
+    return jnp.stack([a.rho - aligned * b.rho, turn - jnp.pi * half_turns], axis=-1)
+
+
+def polar_in_frame(line_a: PolarLine, T_a_b: SE2) -> PolarLine:
+    """A line of frame a in the coordinates of frame b."""
+    n = normal(line_a)
+    return PolarLine(line_a.rho - n @ T_a_b.xy, line_a.theta - T_a_b.yaw)
+
+
+def normal(line: PolarLine) -> Float[Array, "*batch 2"]:
+    """n = (-sin theta, cos theta)."""
+    return jnp.stack([-jnp.sin(line.theta), jnp.cos(line.theta)], axis=-1)
+
+
+def direction(line: PolarLine) -> Float[Array, "*batch 2"]:
+    """(cos theta, sin theta)."""
+    return jnp.stack([jnp.cos(line.theta), jnp.sin(line.theta)], axis=-1)
 
 
 def line_point_distance(line: Float[Array, "3"], point: Float[Array, "2"]) -> Float[Array, ""]:

@@ -1,10 +1,11 @@
 """The homography that the floor induces between two images; eqs. (4) to (8)."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sofjax.geometry.camera import Camera, Mount, rotation_robot_camera, rotation_z
 from sofjax.geometry.se2 import SE2
+from sofjax.geometry.segments import clip
 
 
 def two_view_homography(
@@ -31,3 +32,20 @@ def two_view_homography(
     R0 = rotation_robot_camera(mount).T
     body = R - jnp.outer(jnp.append(t, 0.0), n) / h  # eq. (7)
     return camera.K @ R0 @ body @ R0.T @ jnp.linalg.inv(camera.K)  # eq. (8)
+
+
+def transfer_segment(
+    H: Float[Array, "3 3"], segment: Float[Array, "2 2"], min_depth_ratio: float = 0.05
+) -> tuple[Float[Array, "2 2"], Bool[Array, ""]]:
+    """x'' ~ H x for both ends of a segment of the floor.
+
+    The third component of H x is the ratio of the depths after and before the motion: what the
+    robot has driven past lies behind the camera, and is clipped away where the ratio falls below
+    `min_depth_ratio`.
+
+    **Returns:** end points in the second image, pixels, and whether any part is before the camera.
+    """
+    ratio = segment @ H[2, :2] + H[2, 2]
+    ahead, some = clip(segment, ratio - min_depth_ratio)
+    x = jnp.concatenate([ahead, jnp.ones((2, 1))], axis=1) @ H.T
+    return x[:, :2] / jnp.where(some, x[:, 2:], 1), some

@@ -1,0 +1,85 @@
+"""Motion model: Gaussian about the odometer's reading, whose systematic errors are learned; III.A."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sofjax.geometry.angles import safe_sqrt
+from sofjax.geometry.se2 import SE2
+
+
+class MotionModel(eqx.Module):
+    """How an odometer errs: noise that grows with the way, and systematic errors with priors.
+
+    The systematic errors b = (distance, left turns, right turns, curvature) are relative scales
+    and a turn in radians per metre driven; a prior of zero switches one off.
+    """
+
+    distance_noise: float = 0.01  # metres per sqrt(metre)
+    lateral_noise: float = 0.003  # metres per sqrt(metre)
+    heading_noise: float = 0.01  # radians per sqrt(metre)
+    turn_noise: float = 0.02  # radians per sqrt(radian)
+    distance_scale_sigma: float = 0.03
+    turn_scale_sigma: float = 0.10
+    curvature_sigma: float = 0.01  # radians per metre
+    bias_drift: float = 0.02  # share of its prior that a systematic error wanders in sqrt(metre)
+
+
+class OdometerBias(eqx.Module):
+    """Gaussian belief of the systematic errors b, given a path: one mean a particle.
+
+    Given the path the errors are linear and their posterior is exact (Rao-Blackwell); the
+    covariance depends on the odometer's reading alone, so that all particles share it.
+    """
+
+    mean: Float[Array, "*batch 4"]
+    covariance: Float[Array, "4 4"]
+
+
+def prior_bias(model: MotionModel) -> OdometerBias:
+    return OdometerBias(jnp.zeros(4), jnp.diag(_prior_sigma(model) ** 2))
+
+
+def _prior_sigma(model: MotionModel) -> Float[Array, "4"]:
+    turn = jnp.asarray(model.turn_scale_sigma)
+    return jnp.stack(
+        [jnp.asarray(model.distance_scale_sigma), turn, turn, jnp.asarray(model.curvature_sigma)]
+    )
+
+
+def sample_motion(
+    model: MotionModel, bias: OdometerBias, odometer: SE2, key: PRNGKeyArray
+) -> tuple[SE2, OdometerBias]:
+    """Draw one particle's motion and learn its systematic errors from the draw.
+
+    The motion in distance and turn is z = u + A b + noise, where u is the reading; drawn from
+    its marginal, it then updates b as a Kalman filter does.
+
+    **Arguments:**
+    - `bias`: belief of one particle, `mean[4]`.
+    - `odometer`: T_previous_current as read, metres and radians.
+
+    **Returns:** T_previous_current drawn, and the belief given the draw.
+    """
+    forward, sideways, turn = odometer.log()  # along the arc, so that half a turn's error bends it
+    distance = jnp.abs(forward)
+    left, right = jnp.maximum(turn, 0), jnp.minimum(turn, 0)
+    zero = jnp.zeros_like(distance)
+    A = jnp.stack([jnp.stack([forward, zero, zero, zero]), jnp.stack([zero, left, right, distance])])
+    variance_distance = model.distance_noise**2 * distance
+    variance_turn = model.heading_noise**2 * distance + model.turn_noise**2 * (left - right)
+    noise = jnp.diag(jnp.stack([variance_distance, variance_turn]))
+
+    wander = jnp.diag((_prior_sigma(model) * model.bias_drift) ** 2 * distance)
+    covariance = bias.covariance + wander
+    S = A @ covariance @ A.T + noise  # diagonal: distance and turn share no error
+    sigma = safe_sqrt(jnp.diag(S))
+    draw = jax.random.normal(key, (3,))
+    innovation = sigma * draw[:2]
+    moved, turned = jnp.stack([forward, turn]) + A @ bias.mean + innovation
+    slip = model.lateral_noise * safe_sqrt(distance) * draw[2]
+
+    gain = covariance @ A.T / jnp.where(sigma > 0, sigma, 1) ** 2
+    learned = OdometerBias(bias.mean + gain @ innovation, covariance - gain @ A @ covariance)
+    return SE2.exp(jnp.stack([moved, sideways + slip, turned])), learned

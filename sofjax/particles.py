@@ -1,0 +1,48 @@
+"""Particles: weights, effective size, and how the next generation is drawn; III.A."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sofjax.geometry.se2 import SE2
+from sofjax.motion import OdometerBias
+
+
+class Particles(eqx.Module):
+    """N hypotheses of the robot's pose and of its odometer's errors."""
+
+    T_world_robot: SE2  # [N]
+    bias: OdometerBias  # mean [N, 4]
+    log_weight: Float[Array, "N"]  # normalised: logsumexp = 0
+
+    def take(self, index: Int[Array, "N"]) -> "Particles":
+        """The chosen particles, with equal weights."""
+        N = self.log_weight.shape[0]
+        T = SE2(self.T_world_robot.xy[index], self.T_world_robot.yaw[index])
+        bias = OdometerBias(self.bias.mean[index], self.bias.covariance)
+        return Particles(T, bias, jnp.full(N, -jnp.log(N)))
+
+
+def effective_size(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
+    """1 / sum w² of normalised weights: N if all are equal, 1 if one has everything."""
+    return jnp.exp(-jax.nn.logsumexp(2 * log_weight))
+
+
+def systematic(key: PRNGKeyArray, log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
+    """Indices drawn by systematic resampling: one uniform number and N equally spaced teeth."""
+    N = log_weight.shape[0]
+    cumulative = jnp.cumsum(jnp.exp(log_weight))
+    teeth = (jax.random.uniform(key) + jnp.arange(N)) / N * cumulative[-1]
+    return jnp.clip(jnp.searchsorted(cumulative, teeth), 0, N - 1)
+
+
+def winner(log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
+    """The paper's choice: the single most likely particle, N times."""
+    return jnp.full(log_weight.shape, jnp.argmax(log_weight))
+
+
+def mean_pose(particles: Particles) -> SE2:
+    """Weighted mean, the yaw about that of the heaviest particle."""
+    w = jnp.exp(particles.log_weight)
+    return SE2(w @ particles.T_world_robot.xy, w @ particles.T_world_robot.yaw)

@@ -1,0 +1,234 @@
+"""SoF-SLAM; Fig. 6 of the paper as one pure, jitted step."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from sofjax.association import Association
+from sofjax.geometry.camera import Camera, Mount
+from sofjax.geometry.se2 import SE2
+from sofjax.geometry.segments import Segments
+from sofjax.likelihood import SensorModel, compare, sight
+from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion
+from sofjax.observation import Observation
+from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
+from sofjax.segment_map import MapRules, SegmentMap, empty_map, integrate, is_raised, propose
+from sofjax.sof import extract
+
+LOST_AFTER = 10  # images without one known segment
+
+
+class FilterRules(eqx.Module):
+    """How many particles, and how the next generation is chosen."""
+
+    particles: int = eqx.field(static=True, default=1000)  # N
+    choice: str = eqx.field(static=True, default="resample")  # or "winner", the paper's
+    effective_share: float = 0.5  # resample below this share of N
+    gate_each: bool = eqx.field(static=True, default=False)  # Fig. 6, step 4: SoF for every particle
+    max_depth: float = 8.0  # metres: farther segments are not used
+
+
+class SlamConfig(eqx.Module):
+    """Every setting of the method, beside the part that reads it."""
+
+    association: Association = Association()
+    motion: MotionModel = MotionModel()
+    sensor: SensorModel = SensorModel()
+    segment_map: MapRules = MapRules()
+    filter: FilterRules = FilterRules()
+
+
+class View(eqx.Module):
+    """An image kept for eq. (9), and where it was taken."""
+
+    segments_image: Segments  # [M]
+    T_world_robot: SE2
+
+
+class SlamState(eqx.Module):
+    """What is carried from one image to the next."""
+
+    particles: Particles
+    segment_map: SegmentMap
+    recent: View  # the last two views kept, a baseline apart
+    reference: View
+    unmatched: Int[Array, ""]  # images in a row without one known segment
+    key: PRNGKeyArray
+
+
+class StepInfo(eqx.Module):
+    """What one step tells and does not carry."""
+
+    T_world_robot: SE2  # the estimate
+    bias: Float[Array, "*batch 4"]  # its odometer's errors
+    effective_size: Float[Array, "*batch"]
+    log_evidence: Float[Array, "*batch"]  # log of the mean likelihood of the particles
+    tilt: Float[Array, "*batch 2"]  # wobble (pitch, roll) of the moment, radians
+    detected: Int[Array, "*batch"]
+    below_horizon: Int[Array, "*batch"]  # on the floor's side of the horizon and within range
+    associated: Int[Array, "*batch"]  # by eq. (9)
+    matched: Int[Array, "*batch"]  # to the map
+    born: Int[Array, "*batch"]  # new in the map
+    map_overflow: Int[Array, "*batch"]  # found no free slot
+    lost: Bool[Array, "*batch"]
+    segment_class: Int[Array, "*batch M"]  # 0 none, 1 above the horizon, 2 not floor, 3 floor
+
+
+def init(
+    config: SlamConfig, camera: Camera, mount: Mount, key: PRNGKeyArray, capacity: int
+) -> SlamState:
+    """All particles at the origin of the world, before the first image.
+
+    **Arguments:**
+    - `capacity`: M, the number of segments that an observation has room for.
+    """
+    N = config.filter.particles
+    bias = prior_bias(config.motion)
+    particles = Particles(
+        SE2(jnp.zeros((N, 2)), jnp.zeros(N)),
+        OdometerBias(jnp.broadcast_to(bias.mean, (N, 4)), bias.covariance),
+        jnp.full(N, -jnp.log(N)),
+    )
+    none = View(Segments(jnp.zeros((capacity, 2, 2)), jnp.zeros(capacity, bool)), SE2.identity())
+    return SlamState(particles, empty_map(config.segment_map), none, none, jnp.zeros((), int), key)
+
+
+@eqx.filter_jit
+def step(
+    config: SlamConfig, camera: Camera, mount: Mount, state: SlamState, observation: Observation
+) -> tuple[SlamState, StepInfo]:
+    """One round of Fig. 6. Pure; compiled once for all images of one capacity."""
+    rules, sensor = config.segment_map, config.sensor
+    N = config.filter.particles
+    key, key_motion, key_choice = jax.random.split(state.key, 3)
+    before = mean_pose(state.particles)
+
+    # 1-3) move, and sample N particles by the motion model
+    motion, bias = jax.vmap(
+        sample_motion, in_axes=(None, OdometerBias(0, None), None, 0), out_axes=(0, OdometerBias(0, None))
+    )(config.motion, state.particles.bias, observation.motion, jax.random.split(key_motion, N))
+    T_world_robot = state.particles.T_world_robot @ motion
+    moved = Particles(T_world_robot, bias, state.particles.log_weight)
+    predicted = mean_pose(moved)
+
+    # 4) put the segments on the floor, and extract SoF (Fig. 5) against a view a baseline away
+    sightings = sight(sensor, camera, mount, observation.segments_image, config.filter.max_depth)
+    view = _view_a_baseline_away(config.association, state, predicted)
+    sof = lambda T: extract(
+        config.association, camera, mount, view.segments_image, observation.segments_image,
+        view.T_world_robot.between(T),
+    ).is_floor  # fmt: skip
+    is_sof = sof(predicted)
+    used = jax.vmap(sof)(T_world_robot) if config.filter.gate_each else sightings.valid[None]
+    used = jnp.broadcast_to(used, (N, used.shape[1]))
+
+    # 5) compare with the map by the sensor model, and choose
+    T_world_foot = predicted @ mount.T_robot_foot
+    candidates, slot, nearest = propose(rules, sensor, state.segment_map, sightings, T_world_foot)
+    feet = T_world_foot.inverse() @ (T_world_robot @ mount.T_robot_foot)
+    of_pose = lambda T, use: compare(sensor, sightings, candidates, T, use)
+    log_likelihood = jax.vmap(lambda T, use: of_pose(T, use).log_likelihood)(feet, used)
+    log_weight = moved.log_weight + log_likelihood
+    log_evidence = jax.nn.logsumexp(log_weight)
+    weighted = Particles(T_world_robot, bias, log_weight - log_evidence)
+    size = effective_size(weighted.log_weight)
+    if config.filter.choice == "winner":
+        particles = weighted.take(winner(weighted.log_weight))
+        chosen = mean_pose(particles)
+    else:
+        chosen = mean_pose(weighted)
+        resampled = weighted.take(systematic(key_choice, weighted.log_weight))
+        few = size < config.filter.effective_share * N
+        particles = jax.tree.map(lambda a, b: jnp.where(few, a, b), resampled, weighted)
+
+    # 6) integrate the observed segments into the map, as seen from the chosen pose
+    T_world_foot_chosen = chosen @ mount.T_robot_foot
+    best = of_pose(T_world_foot.between(T_world_foot_chosen), sightings.valid)
+    known = sightings.valid & (best.error < sensor.e_max)
+    new = is_sof & (nearest > sensor.e_max) & sightings.valid & ~known
+    segment_map, overflow = integrate(
+        rules, sensor, state.segment_map, sightings,
+        jnp.take_along_axis(slot, best.choice[:, None], 1)[:, 0],
+        known, new, best.tilt, T_world_foot_chosen,
+    )  # fmt: skip
+
+    # 7) the next round starts from here
+    recent, reference = _keep_views(config.association, state, observation, chosen)
+    unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
+    detected = observation.segments_image.valid
+    info = StepInfo(
+        T_world_robot=chosen,
+        bias=jnp.exp(weighted.log_weight) @ bias.mean,
+        effective_size=size,
+        log_evidence=log_evidence,
+        tilt=best.tilt,
+        detected=detected.sum(),
+        below_horizon=sightings.valid.sum(),
+        associated=is_sof.sum(),
+        matched=known.sum(),
+        born=new.sum() - overflow,
+        map_overflow=overflow,
+        lost=unmatched >= LOST_AFTER,
+        segment_class=detected.astype(int) + sightings.valid + (sightings.valid & (known | new)),
+    )
+    return SlamState(particles, segment_map, recent, reference, unmatched, key), info
+
+
+@eqx.filter_jit
+def run(
+    config: SlamConfig, camera: Camera, mount: Mount, state: SlamState, observations: Observation
+) -> tuple[SlamState, StepInfo]:
+    """A whole log as one scan: the same as `step` for one image after the other.
+
+    **Arguments:**
+    - `observations`: leaves with a leading axis T.
+
+    **Returns:** the last state, and the infos with a leading axis T.
+    """
+    return jax.lax.scan(lambda s, o: step(config, camera, mount, s, o), state, observations)
+
+
+def _far_enough(config: Association, view: View, T_world_robot: SE2) -> Bool[Array, ""]:
+    motion = view.T_world_robot.between(T_world_robot)
+    far = jnp.sum(motion.xy**2) >= config.baseline_distance**2
+    return far | (jnp.abs(motion.yaw) >= config.baseline_angle)
+
+
+def _view_a_baseline_away(config: Association, state: SlamState, T_world_robot: SE2) -> View:
+    """The most recent kept view that is far enough, so that eq. (9) can tell the floor."""
+    enough = _far_enough(config, state.recent, T_world_robot)
+    return jax.tree.map(lambda a, b: jnp.where(enough, a, b), state.recent, state.reference)
+
+
+def _keep_views(config, state, observation, T_world_robot):
+    view = View(observation.segments_image, T_world_robot)
+    first = ~state.recent.segments_image.valid.any()
+    keep = _far_enough(config, state.recent, T_world_robot) | first
+    pick = lambda a, b: jax.tree.map(lambda x, y: jnp.where(keep, x, y), a, b)
+    return pick(view, state.recent), pick(state.recent, state.reference)
+
+
+class FinalMap(eqx.Module):
+    """What the map says in the end."""
+
+    endpoints_world: Float[Array, "K 2 2"]  # metres
+    is_floor: Bool[Array, "K"]  # the segments on the floor; all else is not part of the map
+    updates: Int[Array, "K"]  # how often each was seen
+    height: Float[Array, "K"]  # metres above the floor, by the views of the line
+    height_sigma: Float[Array, "K"]  # metres
+
+
+def final_map(config: SlamConfig, mount: Mount, segment_map: SegmentMap) -> FinalMap:
+    """The segments seen often enough that do not stand above the floor."""
+    rules = config.segment_map
+    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, segment_map.line, segment_map.covariance)
+    often = segment_map.updates >= rules.min_updates
+    kappa = segment_map.line[:, 2]
+    return FinalMap(
+        endpoints_world=segment_map.segments_world.endpoints,
+        is_floor=segment_map.valid & often & ~raised,
+        updates=segment_map.updates,
+        height=mount.height * (1 - 1 / kappa),
+        height_sigma=mount.height * jnp.sqrt(segment_map.covariance[:, 2, 2]) / kappa**2,
+    )
