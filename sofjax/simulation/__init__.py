@@ -1,0 +1,1 @@
+"""Corridors, robots that are driven through them, and what their cameras see."""

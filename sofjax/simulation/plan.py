@@ -1,0 +1,103 @@
+"""The plan of a corridor: the union of rectangles, the walls around it, what lies inside."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+def union_walls(corridors: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "walls 2 2"]:
+    """The walls around a union of rectangles, each as long as it runs straight.
+
+    **Arguments:**
+    - `corridors`: x_min, y_min, x_max, y_max of each rectangle, metres.
+
+    **Returns:** end points on the floor, in metres, so directed that the corridor is on the left.
+    """
+    x = np.unique(corridors[:, [0, 2]])
+    y = np.unique(corridors[:, [1, 3]])
+    centres = np.stack(np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2, indexing="ij"), -1)
+    cells = np.pad(inside(corridors, centres), 1)  # cell (i, j) lies left of x[i] and below y[j]
+    walls = []
+    for j in range(len(y)):
+        below, above = cells[1:-1, j], cells[1:-1, j + 1]
+        walls += [((x[a], y[j]), (x[b], y[j])) for a, b in _runs(above & ~below)]
+        walls += [((x[b], y[j]), (x[a], y[j])) for a, b in _runs(below & ~above)]
+    for i in range(len(x)):
+        left, right = cells[i, 1:-1], cells[i + 1, 1:-1]
+        walls += [((x[i], y[a]), (x[i], y[b])) for a, b in _runs(left & ~right)]
+        walls += [((x[i], y[b]), (x[i], y[a])) for a, b in _runs(right & ~left)]
+    return np.array(walls, float)
+
+
+def _runs(flags: Bool[np.ndarray, "n"]) -> list[tuple[int, int]]:
+    """First and one past the last index of every run of true."""
+    edges = np.flatnonzero(np.diff(np.pad(flags.astype(int), 1)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def inside(
+    corridors: Float[np.ndarray, "n 4"], points: Float[np.ndarray, "*batch 2"]
+) -> Bool[np.ndarray, "*batch"]:
+    """Whether points lie in the union of rectangles."""
+    p = points[..., None, :]
+    return ((p >= corridors[:, :2]) & (p <= corridors[:, 2:])).all(-1).any(-1)
+
+
+def left_normal(direction: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    return np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
+
+
+def wall_directions(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, "walls 2"]:
+    d = walls[:, 1] - walls[:, 0]
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def parts_inside(
+    corridors: Float[np.ndarray, "n 4"], segment: Float[np.ndarray, "2 2"], shortest: float = 0.1
+) -> list[np.ndarray]:
+    """The parts of a segment that lie in the union of rectangles, at least `shortest` metres long."""
+    start, way = segment[0], segment[1] - segment[0]
+    parts = []
+    for x0, y0, x1, y1 in corridors:
+        first, last = 0.0, 1.0
+        for position, step, low, high in ((start[0], way[0], x0, x1), (start[1], way[1], y0, y1)):
+            if abs(step) < 1e-12:
+                if not low <= position <= high:
+                    last = -1.0
+                continue
+            a, b = sorted(((low - position) / step, (high - position) / step))
+            first, last = max(first, a), min(last, b)
+        if first < last:
+            parts.append((first, last))
+    merged: list[list[float]] = []
+    for first, last in sorted(parts):
+        if merged and first <= merged[-1][1] + 1e-9:
+            merged[-1][1] = max(merged[-1][1], last)
+        else:
+            merged.append([first, last])
+    length = float(np.linalg.norm(way))
+    return [start + np.outer(part, way) for part in merged if (part[1] - part[0]) * length > shortest]
+
+
+def offset_walls(
+    corridors: Float[np.ndarray, "n 4"], walls: Float[np.ndarray, "walls 2 2"], distance: float
+) -> Float[np.ndarray, "walls 2 2"]:
+    """The walls moved `distance` into the corridor, cut and lengthened so that they meet again."""
+    moved = []
+    for wall, d in zip(walls, wall_directions(walls), strict=True):
+        n = np.array([-d[1], d[0]])
+        back, on = (inside(corridors, p + 1e-3 * (s * d + n)) for p, s in zip(wall, (-1, 1), strict=True))
+        lengthen = np.array([-1 if back else 1, 1 if on else -1])[:, None] * distance * d
+        moved.append(wall + distance * n + lengthen)
+    return np.array(moved)
+
+
+def distance_to_way(
+    way: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "points 2"]
+) -> Float[np.ndarray, "points"]:
+    """Distance of points from a broken line, metres."""
+    best = np.full(len(points), np.inf)
+    for a, b in zip(way[:-1], way[1:], strict=True):
+        d = b - a
+        s = np.clip((points - a) @ d / max(d @ d, 1e-12), 0, 1)
+        best = np.minimum(best, np.linalg.norm(points - (a + s[:, None] * d), axis=-1))
+    return best
