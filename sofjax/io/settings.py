@@ -1,0 +1,141 @@
+"""Settings as names with dots: from TOML and the command line into frozen dataclasses, and back.
+
+A setting is a leaf of a tree of dataclasses, `motion.distance_noise`; its default tells its type.
+A field with `INLINE` as its metadata lends its own fields to the level above.
+"""
+
+import dataclasses
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sofjax.io.errors import InputError, nearest
+from sofjax.io.text import SETTINGS_BYTES, read_text
+
+Config = TypeVar("Config")
+Setting = bool | int | float | str
+
+INLINE = {"inline": True}
+
+
+def to_dict(config: Any) -> dict[str, Setting]:
+    """Every setting by its name, in the order of the fields."""
+    return dict(_leaves(config, ""))
+
+
+def with_settings(config: Config, given: Mapping[str, object], where: str) -> Config:
+    """The same settings with some of them changed.
+
+    **Arguments:**
+    - `given`: values by name, of the setting's type, or as text from the command line.
+    - `where`: the file or option, for the sentence of an `InputError`.
+    """
+    known = to_dict(config)
+    values = {}
+    for name, value in given.items():
+        if name not in known:
+            raise InputError(f"{where}: there is no setting '{name}'; {nearest(name, known)}")
+        values[name] = _cast(f"{where}: '{name}'", value, known[name])
+    try:
+        return _replace(config, values, "")
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def read_toml(path: Path) -> dict[str, object]:
+    """The settings of a TOML file by their names; tables become the dots."""
+    path = Path(path)
+    try:
+        table = tomllib.loads(read_text(path, "the settings file", SETTINGS_BYTES))
+    except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not TOML: {str(error) or type(error).__name__}") from None
+    return dict(_flatten(table, ""))
+
+
+def to_toml(settings: Mapping[str, Setting]) -> str:
+    """Settings by name as TOML that `read_toml` reads back, number for number."""
+    tables: dict[str, list[str]] = {"": []}
+    for name, value in settings.items():
+        table, _, key = name.rpartition(".")
+        tables.setdefault(table, []).append(f"{key} = {_toml(value)}")
+    blocks = ([f"[{table}]"] * bool(table) + lines for table, lines in tables.items() if lines)
+    return "\n\n".join("\n".join(block) for block in blocks) + "\n"
+
+
+def _leaves(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _leaves(value, _below(field, prefix))
+        else:
+            yield prefix + field.name, value
+
+
+def _replace(config: Config, values: Mapping[str, Setting], prefix: str) -> Config:
+    changed = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            changed[field.name] = _replace(value, values, _below(field, prefix))
+        else:
+            changed[field.name] = values.get(prefix + field.name, value)
+    return dataclasses.replace(config, **changed)
+
+
+def _below(field: dataclasses.Field, prefix: str) -> str:
+    return prefix if field.metadata.get("inline") else f"{prefix}{field.name}."
+
+
+def _flatten(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def _cast(where: str, value: object, like: Setting) -> Setting:
+    """A value as the type of the setting's present one; bool before int, which it also is."""
+    text = isinstance(value, str)
+    if isinstance(like, bool):
+        value = {"true": True, "false": False}.get(value.lower(), value) if text else value
+        if isinstance(value, bool):
+            return value
+        right = "true or false"
+    elif isinstance(like, int):
+        if (text and _parses(int, value)) or type(value) is int:
+            return int(value)
+        right = "a whole number"
+    elif isinstance(like, float):
+        if (text and _parses(float, value)) or type(value) in (int, float):
+            if math.isfinite(float(value)):
+                return float(value)
+        right = "a finite number"
+    else:
+        if text:
+            return value
+        right = "text"
+    raise InputError(f"{where} is {value!r:.60}; it must be {right}")
+
+
+def _parses(kind: type, text: str) -> bool:
+    try:
+        kind(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _toml(value: Setting) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value)
+    return repr(value)

@@ -1,0 +1,46 @@
+"""Reading a text file that a user named, and writing one that is never found half written."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from sofjax.io.errors import InputError
+
+TABLE_BYTES = 256 * 1024 * 1024  # an hour of odometry at 100 Hz has 25 MB
+SETTINGS_BYTES = 1024 * 1024
+
+
+def read_text(path: Path, what: str, max_bytes: int) -> str:
+    """The text of a file; `what` names it in the sentence of the error."""
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise InputError(f"{path}: {what} must be a file, and this is not one")
+        if size > max_bytes:
+            raise InputError(f"{path}: {size} bytes are too many for {what}; at most {max_bytes}")
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: {what} must be text in UTF-8, and this is not") from None
+    except FileNotFoundError:
+        raise InputError(f"{path}: {what} is missing") from None
+    except OSError as error:
+        raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from None
+
+
+def rows(path: Path, what: str) -> Iterator[tuple[int, str]]:
+    """(line number, line) of a table's rows, without blank lines and those that begin with #."""
+    text = read_text(path, what, TABLE_BYTES)
+    for number, line in enumerate(text.splitlines(), start=1):
+        line = line.strip()
+        if line and not line.startswith("#"):
+            yield number, line
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write beside the file, then rename: a reader sees the old text or the new, never a part."""
+    beside = path.with_name(f".{path.name}.part")
+    try:
+        beside.write_text(text, encoding="utf-8")
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)

@@ -1,0 +1,14 @@
+"""The front end: images in, segments out. The only place that knows OpenCV."""
+
+from sofjax.vision.detectors import DETECTORS as DETECTORS
+from sofjax.vision.detectors import Detector as Detector
+from sofjax.vision.detectors import detect_hough as detect_hough
+from sofjax.vision.detectors import detect_lsd as detect_lsd
+from sofjax.vision.frontend import Frontend as Frontend
+from sofjax.vision.frontend import FrontendSettings as FrontendSettings
+from sofjax.vision.frontend import View as View
+from sofjax.vision.frontend import pack as pack
+from sofjax.vision.images import read_image as read_image
+from sofjax.vision.lens import Lens as Lens
+from sofjax.vision.observe import observation as observation
+from sofjax.vision.observe import observe_drive as observe_drive

@@ -1,0 +1,37 @@
+"""From images and odometry to what the filter takes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sofjax.geometry import SE2
+from sofjax.io.drive import Drive, motions
+from sofjax.observation import Observation
+from sofjax.vision.frontend import Frontend, View
+
+
+def observation(view: View, motion: np.ndarray) -> Observation:
+    """One image's observation.
+
+    **Arguments:**
+    - `view`: the image's segments.
+    - `motion`: [3], T_previous_current of the odometer as (dx, dy, dyaw), metres and radians.
+    """
+    motion = np.asarray(motion, np.float32)
+    return Observation(
+        segments_image=view.segments_image,
+        motion=SE2(jnp.asarray(motion[:2]), jnp.asarray(motion[2])),
+        overflow=jnp.asarray(view.overflow, jnp.int32),
+    )
+
+
+def observe_drive(drive: Drive, frontend: Frontend) -> Observation:
+    """A whole drive with a leading axis T: detected once, replayed as often as one likes.
+
+    An image that cannot be read is one without segments.
+    """
+    each = [
+        observation(frontend.view(file), motion)
+        for file, motion in zip(drive.image_files, motions(drive), strict=True)
+    ]
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each)
