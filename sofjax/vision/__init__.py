@@ -8,6 +8,7 @@ from sofjax.vision.frontend import Frontend as Frontend
 from sofjax.vision.frontend import FrontendSettings as FrontendSettings
 from sofjax.vision.frontend import View as View
 from sofjax.vision.frontend import pack as pack
+from sofjax.vision.images import check_images as check_images
 from sofjax.vision.images import read_image as read_image
 from sofjax.vision.lens import Lens as Lens
 from sofjax.vision.observe import observation as observation

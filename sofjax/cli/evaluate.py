@@ -1,0 +1,66 @@
+"""`sofjax evaluate`: a run against the truth."""
+
+import argparse
+import json
+from pathlib import Path
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "evaluate",
+        help="compare a run with the truth",
+        description="Compare the trajectory and the map of a run with the truth of its drive.",
+    )
+    parser.add_argument("folder", metavar="RUN_DIR", type=Path, help="folder of the run")
+    parser.add_argument(
+        "drive", metavar="DRIVE", nargs="?", type=Path, help="default: the drive of the report"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    from sofjax.cli import outputs
+    from sofjax.cli.errors_table import errors_table
+    from sofjax.evaluation import evaluate_map, evaluate_trajectory, shared
+    from sofjax.io.drive import check_folder, read_truth
+    from sofjax.io.errors import InputError
+    from sofjax.io.map_file import read_map
+    from sofjax.io.trajectory import read_trajectory
+
+    if not args.folder.is_dir():
+        raise InputError(f"{args.folder}: there is no such folder; give one that a run has written")
+    drive = check_folder(args.drive or _drive_of(args.folder / outputs.REPORT))
+    truth, true_segments = read_truth(drive)
+    if truth is None:
+        raise InputError(
+            f"{drive / 'groundtruth.txt'}: the true path is missing, and there is nothing to "
+            "compare with"
+        )
+    estimate = read_trajectory(args.folder / outputs.TRAJECTORY, "the trajectory of the run")
+    errors, motion = evaluate_trajectory(truth, estimate)
+    odometry = None
+    if (drive / "odometry.txt").exists():
+        read = read_trajectory(drive / "odometry.txt", "the odometry").at(estimate.stamps)
+        odometry, _ = evaluate_trajectory(truth, read)
+    of_map = None
+    if true_segments is not None and (args.folder / outputs.MAP).exists():
+        segments, _ = read_map(args.folder / outputs.MAP)
+        of_map = evaluate_map(true_segments, segments, motion, shared(truth, estimate).xy)
+    print(f"{args.folder} of {drive.resolve().name}: {errors.path_m:.1f} m")
+    print("\n".join(errors_table(errors, odometry, of_map)))
+    if of_map is None:
+        print("    the map is not compared: its file or floor_segments.csv is missing")
+    return 0
+
+
+def _drive_of(report: Path) -> Path:
+    """The drive that a report names."""
+    from sofjax.io.errors import InputError
+    from sofjax.io.text import TABLE_BYTES, read_text
+
+    try:
+        return Path(json.loads(read_text(report, "the report of the run", TABLE_BYTES))["drive"])
+    except InputError as error:
+        raise InputError(f"{error}; name the drive as a second argument") from None
+    except (ValueError, LookupError, TypeError, RecursionError):
+        raise InputError(f"{report}: names no drive; give it as a second argument") from None

@@ -1,0 +1,234 @@
+"""What a run leaves behind: the map, the figure, the report, and a summary for the terminal."""
+
+import platform
+import resource
+import sys
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from sofjax import slam, viewer
+from sofjax.cli import outputs
+from sofjax.cli.errors_table import errors_table
+from sofjax.cli.settings import RunSettings
+from sofjax.cli.tally import Tally
+from sofjax.evaluation import (
+    MapErrors,
+    RigidMotion,
+    TrajectoryErrors,
+    evaluate_map,
+    evaluate_trajectory,
+    shared,
+)
+from sofjax.io.camera_file import doubts
+from sofjax.io.drive import Drive, outside
+from sofjax.io.errors import InputError
+from sofjax.io.map_file import write_map
+from sofjax.io.settings import to_dict
+
+PACKAGES = ("sofjax", "jax", "jaxlib", "equinox", "numpy", "opencv-python-headless")
+
+
+@dataclass
+class Results:
+    """What came out, beside the trajectory."""
+
+    segments: np.ndarray  # [K, 2, 2], the map's segments on the floor, metres
+    raised: int  # lines that were left out of it for standing above the floor
+    interrupted: bool
+    warnings: list[str]
+    trajectory: TrajectoryErrors | None = None
+    odometry: TrajectoryErrors | None = None  # of the odometry alone, at the same images
+    map: MapErrors | None = None
+
+
+def write_results(
+    folder: Path,
+    drive: Drive,
+    settings: RunSettings,
+    tally: Tally,
+    state: slam.SlamState | None,
+    interrupted: bool,
+) -> Results:
+    """Write the map and the figure, and compare with the truth where it is known."""
+    results = Results(np.zeros((0, 2, 2)), 0, interrupted, warnings(drive, tally))
+    seen, height = np.zeros(0, int), np.zeros(0)
+    if state is not None:
+        final = jax.device_get(
+            slam.final_map(settings.slam, drive.camera_file.mount, state.segment_map)
+        )
+        keep = final.is_floor
+        results.segments, seen, height = (
+            v[keep] for v in (final.endpoints_world.astype(float), final.updates, final.height)
+        )
+        often = final.updates >= settings.slam.segment_map.min_updates
+        results.raised = int((np.asarray(state.segment_map.valid) & often & ~keep).sum())
+    write_map(folder / outputs.MAP, results.segments, seen, height)
+    motion = _compare(drive, tally, results) if tally.stamps else None
+    if not viewer.available():
+        results.warnings.append(viewer.MISSING)
+    elif tally.stamps:
+        _draw(folder / outputs.FIGURE, drive, tally, results, motion)
+    return results
+
+
+def _compare(drive: Drive, tally: Tally, results: Results) -> RigidMotion | None:
+    """Errors against the truth; the motion onto it, or None if nothing is there to compare with."""
+    if drive.groundtruth is None:
+        return None
+    estimate = tally.trajectory
+    try:
+        results.trajectory, motion = evaluate_trajectory(drive.groundtruth, estimate)
+        odometry = drive.odometry.at(estimate.stamps)
+        results.odometry, _ = evaluate_trajectory(drive.groundtruth, odometry)
+    except InputError as error:
+        results.warnings.append(f"no errors against the truth: {error}")
+        return None
+    if drive.floor_segments is not None:
+        path = shared(drive.groundtruth, estimate).xy
+        results.map = evaluate_map(drive.floor_segments, results.segments, motion, path)
+    return motion
+
+
+def _draw(
+    path: Path, drive: Drive, tally: Tally, results: Results, motion: RigidMotion | None
+) -> None:
+    """The figure in the frame of the truth if it is known, and in the map's otherwise."""
+    estimate = tally.trajectory
+    odometry = drive.odometry.at(estimate.stamps)
+    turn = estimate.yaw[0] - odometry.yaw[0]
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    odometry = RigidMotion(R, estimate.xy[0] - R @ odometry.xy[0]).apply(odometry.xy)
+    to_truth = motion or RigidMotion(np.eye(2), np.zeros(2))
+    title = f"{drive.name}: {len(estimate.stamps)} images, {estimate.travelled[-1]:.1f} m"
+    if results.trajectory:
+        e = results.trajectory
+        title += f", {e.ate_m:.3f} m and {e.yaw_deg:.2f}° from the true path"
+    viewer.draw_map(
+        path,
+        title,
+        robot=to_truth.apply(estimate.xy),
+        odometry=to_truth.apply(odometry),
+        segments=to_truth.apply(results.segments),
+        true_robot=drive.groundtruth.xy if motion else None,
+        true_segments=drive.floor_segments if motion else None,
+    )
+
+
+def warnings(drive: Drive, tally: Tally) -> list[str]:
+    """Sentences on what was odd about the drive."""
+    found = doubts(drive.camera_file)
+    n = len(tally.stamps)
+    for count, text in (
+        (len(tally.unreadable), "images could not be read as the camera's; the odometry bridged"),
+        (tally.blind, "images had no segment at all; the odometry bridged them"),
+        (int(outside(drive.odometry, np.array(tally.stamps)).sum()), "images lie outside the time "
+         "of the odometry, and the robot was taken to stand still"),
+        (tally.step["lost"], "images were lost: nothing seen was in the map for ten and more"),
+    ):  # fmt: skip
+        if count:
+            found.append(f"{count} of {n} {text}")
+    if tally.overflow:
+        found.append(
+            f"{tally.overflow} of {tally.detected} segments found no place in an observation; "
+            "raise frontend.capacity if that is many"
+        )
+    if tally.step["map_overflow"]:
+        found.append(
+            f"the map was full, and {tally.step['map_overflow']} new lines found no place; "
+            "raise segment_map.capacity"
+        )
+    return found
+
+
+def write_report(
+    folder: Path,
+    drive: Drive,
+    settings: RunSettings,
+    tally: Tally,
+    results: Results,
+    seconds: dict[str, float],
+) -> None:
+    """`report.json`: all that there is to know about a run, for machines and for later."""
+    outputs.write_json(
+        folder / outputs.REPORT,
+        {
+            "drive": str(drive.path.resolve()),
+            "interrupted": results.interrupted,
+            "seed": settings.seed,
+            "settings": to_dict(settings),
+            "versions": {"python": platform.python_version()}
+            | {package: version(package) for package in PACKAGES},
+            "device": f"{jax.default_backend()}, {platform.machine()}",
+            "funnel": {
+                "images": len(tally.stamps),
+                "segments": tally.detected,
+                "below_horizon": tally.step["below_horizon"],
+                "associated": tally.step["associated"],
+                "matched": tally.step["matched"],
+                "born": tally.step["born"],
+                "mapped": len(results.segments),
+            },
+            "raised": results.raised,
+            "overflow": {"segments": tally.overflow, "map": tally.step["map_overflow"]},
+            "images": {
+                "listed": len(drive.image_files),
+                "done": len(tally.stamps),
+                "without_segments": tally.blind,
+                "lost": tally.step["lost"],
+                "unreadable": tally.unreadable,
+            },
+            "frames_per_second": tally.frames_per_second,
+            "milliseconds_per_image": tally.milliseconds(),
+            "seconds": seconds | {"first_image": sum(tally.seconds[0].values())}
+            if tally.seconds
+            else seconds,
+            "peak_memory_mib": peak_memory(),
+            "errors": {
+                name: asdict(errors) if errors else None
+                for name, errors in (
+                    ("trajectory", results.trajectory),
+                    ("odometry", results.odometry),
+                    ("map", results.map),
+                )
+            },
+            "warnings": results.warnings,
+        },
+    )
+
+
+def peak_memory() -> float:
+    """MiB that the process has held at most."""
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def summary(
+    folder: Path, drive: Drive, tally: Tally, results: Results, seconds: dict[str, float]
+) -> str:
+    """The run in a few lines for a person."""
+    n, step = len(tally.stamps), tally.step
+    way = tally.trajectory.travelled[-1] if n else 0.0
+    fps = tally.frames_per_second
+    stages = ", ".join(f"{stage} {ms:.1f}" for stage, ms in tally.milliseconds().items())
+    lines = [
+        f"{drive.name}: {n} images, {way:.1f} m"
+        + f"; interrupted before {len(drive.image_files) - n} more" * results.interrupted,
+        f"  segments  {tally.detected} found, {step['below_horizon']} on the floor's side of the "
+        f"horizon, {step['associated']} associated, {step['matched']} matched to the map",
+        f"  map       {len(results.segments)} segments on the floor; {results.raised} lines above "
+        "it left out",
+        f"  time      {sum(seconds.values()):.1f} s"
+        + (f"; {fps:.0f} frames a second ({stages} ms)" if fps else ""),
+    ]
+    if results.trajectory:
+        lines += errors_table(results.trajectory, results.odometry, results.map)
+    lines += [f"  warning   {warning}" for warning in results.warnings]
+    if tally.unreadable:
+        few = ", ".join(tally.unreadable[:3])
+        lines.append(f"            not read: {few}{' ...' * (len(tally.unreadable) > 3)}")
+    lines.append(f"written to {folder}/")
+    return "\n".join(lines)

@@ -1,0 +1,135 @@
+"""`sofjax run`: a drive in, a trajectory and a map out."""
+
+import argparse
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sofjax.cli.settings import RunSettings
+    from sofjax.io.drive import Drive
+    from sofjax.slam import SlamState, StepInfo
+    from sofjax.vision import Frontend, View
+
+AHEAD = 8  # images that are searched for segments before the filter asks for them
+
+
+def add_parser(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "run",
+        help="estimate the trajectory and the map of a drive",
+        description="Estimate the trajectory and the map of floor segments of a drive.",
+        usage="sofjax run DRIVE [--out DIR] [--particles N] [--seed S] [--detector hough|lsd] "
+        "[--config FILE] [--set name=value ...]",
+    )
+    parser.add_argument("drive", metavar="DRIVE", nargs="?", type=Path, help="folder of the drive")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="default: runs/<drive>-<time>/")
+    parser.add_argument("--particles", metavar="N", type=int, help="size of the filter")
+    parser.add_argument("--seed", metavar="S", type=int, help="of the random numbers; default 0")
+    parser.add_argument("--detector", choices=("hough", "lsd"), help="of the segments in an image")
+    parser.add_argument("--config", metavar="FILE", type=Path, help="settings as TOML")
+    parser.add_argument(
+        "--set",
+        metavar="name=value",
+        dest="sets",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="change settings, such as motion.distance_noise=0.02 or preset=paper",
+    )
+    parser.set_defaults(run=run, parser=parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, drive, write. Ctrl-C ends the drive early, and what was done until then is written."""
+    _drive_behind_set(args)
+    begun = time.perf_counter()
+    from tqdm import tqdm
+
+    from sofjax.cli import outputs, report
+    from sofjax.cli.settings import gather
+    from sofjax.cli.tally import Tally
+    from sofjax.io.drive import read_drive
+    from sofjax.io.settings import to_dict, to_toml
+    from sofjax.io.text import write_atomically
+    from sofjax.io.trajectory import TrajectoryWriter
+    from sofjax.vision import Frontend, check_images
+
+    settings = gather(args)
+    drive = read_drive(args.drive)
+    check_images(drive)
+    frontend = Frontend(drive.camera_file, settings.frontend)
+    folder = outputs.make_folder(args.out, drive.name)
+    write_atomically(folder / outputs.CONFIG, to_toml(to_dict(settings)))
+
+    tally, state, interrupted = Tally(), None, False
+    started = time.perf_counter()
+    bar = tqdm(total=len(drive.image_files), desc=drive.name, unit=" frames", disable=None)
+    with bar, TrajectoryWriter(folder / outputs.TRAJECTORY) as writer:
+        try:
+            for view, info, seconds, state in steps(settings, drive, frontend):  # noqa: B007
+                tally.add(drive, view, info, seconds, time.perf_counter())
+                writer.write(tally.stamps[-1], tally.poses[-1][:2], tally.poses[-1][2])
+                bar.update()
+        except KeyboardInterrupt:
+            interrupted = True
+    driven = time.perf_counter()
+
+    results = report.write_results(folder, drive, settings, tally, state, interrupted)
+    ended = time.perf_counter()
+    seconds = {"start": started - begun, "drive": driven - started, "write": ended - driven}
+    report.write_report(folder, drive, settings, tally, results, seconds)
+    print(report.summary(folder, drive, tally, results, seconds))
+    return 130 if interrupted else 0
+
+
+def steps(
+    settings: "RunSettings", drive: "Drive", frontend: "Frontend"
+) -> Iterator[tuple["View", "StepInfo", dict[str, float], "SlamState"]]:
+    """Fig. 6 for one image after the other, with the seconds that each waited and computed."""
+    import jax
+
+    from sofjax import slam
+    from sofjax.io.drive import motions
+    from sofjax.vision import observation
+
+    config, camera, mount = settings.slam, drive.camera_file.camera, drive.camera_file.mount
+    key = jax.random.key(settings.seed)
+    state = slam.init(config, camera, mount, key, settings.frontend.capacity)
+    with closing(views(frontend, drive.image_files)) as coming:
+        for motion in motions(drive):
+            begun = time.perf_counter()
+            view = next(coming)
+            waited = time.perf_counter()
+            observed = observation(view, motion)
+            state, info = slam.step(config, camera, mount, state, observed)
+            info = jax.device_get(info)
+            stepped = time.perf_counter()
+            yield view, info, {"wait": waited - begun, "step": stepped - waited}, state
+
+
+def views(frontend: "Frontend", files: list[Path]) -> Iterator["View"]:
+    """The views of the images in order, made ahead of time by a thread of their own."""
+    worker = ThreadPoolExecutor(max_workers=1)
+    try:
+        coming = [worker.submit(frontend.view, file) for file in files[:AHEAD]]
+        for i in range(len(files)):
+            view = coming.pop(0).result()
+            if i + AHEAD < len(files):
+                coming.append(worker.submit(frontend.view, files[i + AHEAD]))
+            yield view
+    finally:
+        worker.shutdown(cancel_futures=True)
+
+
+def _drive_behind_set(args: argparse.Namespace) -> None:
+    """`--set a=1 DRIVE`: the option takes all the words that follow it, and so the drive too."""
+    words = [word for word in args.sets if "=" not in word]
+    if args.drive is None and len(words) == 1:
+        args.drive = Path(words[0])
+        args.sets.remove(words[0])
+    if args.drive is None:
+        args.parser.error("the following arguments are required: DRIVE")

@@ -1,0 +1,86 @@
+"""From the options of the command line to the settings of a run."""
+
+import argparse
+import dataclasses
+
+from sofjax import presets
+from sofjax.io.errors import InputError, nearest
+from sofjax.io.settings import INLINE, read_toml, to_dict, with_settings
+from sofjax.slam import SlamConfig
+from sofjax.vision import DETECTORS, FrontendSettings
+
+FRONTENDS = {"paper": FrontendSettings(detector="hough")}  # of a preset; the default otherwise
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSettings:
+    """All that decides what a run writes, beside the drive."""
+
+    seed: int
+    frontend: FrontendSettings
+    slam: SlamConfig = dataclasses.field(metadata=INLINE)
+
+
+def gather(args: argparse.Namespace) -> RunSettings:
+    """The default, changed by the file, by `--set`, and by the options of their own, in this order.
+
+    In the file as in `--set`, a `preset` comes first, wherever it stands.
+    """
+    settings = _preset("default", "")
+    if args.config is not None:
+        settings = _changed(settings, read_toml(args.config), str(args.config))
+    settings = _changed(settings, _pairs(args.sets), "--set")
+    named = {
+        "--particles": ("filter.particles", getattr(args, "particles", None)),
+        "--seed": ("seed", getattr(args, "seed", None)),
+        "--detector": ("frontend.detector", getattr(args, "detector", None)),
+    }
+    for option, (name, value) in named.items():
+        if value is not None:
+            settings = _changed(settings, {name: value}, option)
+    return settings
+
+
+def _changed(settings: RunSettings, given: dict[str, object], where: str) -> RunSettings:
+    given = dict(given)
+    if "preset" in given:
+        settings = dataclasses.replace(_preset(given.pop("preset"), where), seed=settings.seed)
+    settings = with_settings(settings, given, where)
+    check(settings, where)
+    return settings
+
+
+def _preset(name: object, where: str) -> RunSettings:
+    if name not in presets.PRESETS:
+        hint = nearest(str(name), presets.PRESETS)
+        raise InputError(f"{where}: there is no preset {name!r:.60}; {hint}")
+    return RunSettings(0, FRONTENDS.get(name, FrontendSettings()), presets.PRESETS[name])
+
+
+def _pairs(sets: list[str]) -> dict[str, object]:
+    given = {}
+    for pair in sets:
+        name, equals, value = pair.partition("=")
+        if not equals or not name.strip():
+            raise InputError(f"--set: '{pair}' must have the form name=value")
+        given[name.strip()] = value.strip()
+    return given
+
+
+def check(settings: RunSettings, where: str) -> None:
+    """Refuse numbers that no run can use."""
+    for name, value in to_dict(settings).items():
+        if not isinstance(value, str) and value < 0:
+            raise InputError(f"{where}: '{name}' is {value}; it must not be negative")
+    least = {"filter.particles": (1, 1_000_000), "frontend.capacity": (1, 4096)}
+    for name, (low, high) in least.items():
+        value = to_dict(settings)[name]
+        if not low <= value <= high:
+            raise InputError(f"{where}: '{name}' is {value}; it must be from {low} to {high}")
+    if settings.seed >= 2**32:
+        raise InputError(f"{where}: 'seed' is {settings.seed}; it must be below 2^32")
+    if settings.frontend.detector not in DETECTORS:
+        raise InputError(
+            f"{where}: 'frontend.detector' is '{settings.frontend.detector}'; it must be "
+            f"{' or '.join(DETECTORS)}"
+        )

@@ -1,0 +1,69 @@
+"""What a run counts on its way through a drive."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sofjax.io.drive import Drive
+from sofjax.io.errors import InputError
+from sofjax.io.trajectory import Trajectory
+from sofjax.slam import StepInfo
+from sofjax.vision import View
+
+WARM = 10  # images that timing leaves out: the first one compiles
+OF_THE_STEP = ("below_horizon", "associated", "matched", "born", "map_overflow", "lost")
+
+
+@dataclass
+class Tally:
+    """Poses, counts and times of the images done so far."""
+
+    stamps: list[float] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)  # (x, y, yaw), metres, radians
+    unreadable: list[str] = field(default_factory=list)  # files
+    blind: int = 0  # images that were read and had no segment
+    detected: int = 0  # segments
+    overflow: int = 0  # segments that found no place in an observation
+    step: dict[str, int] = field(default_factory=lambda: dict.fromkeys(OF_THE_STEP, 0))
+    seconds: list[dict[str, float]] = field(default_factory=list)  # of each stage, per image
+    done: list[float] = field(default_factory=list)  # clock at the end of each image
+
+    def add(
+        self, drive: Drive, view: View, info: StepInfo, seconds: dict[str, float], now: float
+    ) -> None:
+        """The next image: what the front end saw, what the step said, and how long each took."""
+        i = len(self.stamps)
+        pose = np.append(info.T_world_robot.xy, info.T_world_robot.yaw).astype(float)
+        if not np.isfinite(pose).all():
+            raise InputError(
+                f"the estimate is not a number at image {i + 1}, {drive.image_files[i].name}; "
+                "some setting is out of all proportion, such as a sigma of zero"
+            )
+        self.stamps.append(float(drive.image_stamps[i]))
+        self.poses.append(pose)
+        if not view.readable:
+            self.unreadable.append(str(drive.image_files[i].relative_to(drive.path)))
+        self.blind += view.readable and view.detected == 0
+        self.detected += view.detected
+        self.overflow += view.overflow
+        for name in OF_THE_STEP:
+            self.step[name] += int(getattr(info, name))
+        self.seconds.append(view.seconds | seconds)
+        self.done.append(now)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        poses = np.reshape(self.poses, (-1, 3))
+        return Trajectory(np.array(self.stamps), poses[:, :2], np.unwrap(poses[:, 2]))
+
+    @property
+    def frames_per_second(self) -> float | None:
+        """After the first ten images; None in a drive that has no more."""
+        n = len(self.done) - WARM
+        return n / (self.done[-1] - self.done[WARM - 1]) if n > 0 else None
+
+    def milliseconds(self) -> dict[str, float]:
+        """Mean of each stage after the first ten images, or of all if there are no more."""
+        seconds = self.seconds[WARM:] or self.seconds
+        stages = seconds[0] if seconds else {}
+        return {stage: 1e3 * float(np.mean([s[stage] for s in seconds])) for stage in stages}

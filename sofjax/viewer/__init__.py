@@ -1,0 +1,6 @@
+"""Figures to look at. The only place that knows matplotlib, which is an extra."""
+
+from sofjax.viewer.figures import MISSING as MISSING
+from sofjax.viewer.figures import available as available
+from sofjax.viewer.figures import draw_images as draw_images
+from sofjax.viewer.figures import draw_map as draw_map

@@ -1,0 +1,145 @@
+"""The map from above, and segments in their images."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+
+MISSING = "matplotlib is not installed, so there is no figure: pip install 'sofjax[figures]'"
+
+PATH, ODOMETRY, FLOOR, OTHER, TRUTH = "#c0392b", "#e08e0b", "#1f4e9c", "#d4447c", "#b9c0c7"
+
+
+def available() -> bool:
+    """Whether figures can be drawn at all."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+def draw_map(
+    path: Path,
+    title: str,
+    robot: np.ndarray,
+    odometry: np.ndarray,
+    segments: np.ndarray,
+    true_robot: np.ndarray | None = None,
+    true_segments: np.ndarray | None = None,
+) -> None:
+    """Draw the path and the map as a PNG, all in one frame, metres.
+
+    **Arguments:**
+    - `robot`, `odometry`, `true_robot`: [n, 2] positions.
+    - `segments`, `true_segments`: [K, 2, 2] end points.
+    """
+    known = [robot, odometry, *segments]
+    if true_robot is not None:
+        known.append(true_robot)
+    low, high = _bounds(known)
+    width, height = high - low
+    scale = min(8.0 / width, 8.0 / height)  # inches a metre
+    size = (max(3.0, scale * width) + 3.2, max(3.0, scale * height) + 0.9)
+    figure, axes = _figure(size)
+    lines = _collection(axes)
+    if true_segments is not None:
+        lines(true_segments, TRUTH, 3.0, "true segments on the floor", 1)
+    if true_robot is not None:
+        axes.plot(*true_robot.T, color="#7f8a94", lw=3.0, zorder=2, label="true path")
+    lines(segments, FLOOR, 1.3, f"map: {len(segments)} segments on the floor", 3)
+    axes.plot(*odometry.T, color=ODOMETRY, lw=1.3, ls=(0, (4, 2)), zorder=4, label="odometry alone")
+    axes.plot(*robot.T, color=PATH, lw=1.5, zorder=5, label="estimated path")
+    axes.plot(*robot[0], "o", color=PATH, ms=6, zorder=6, label="start")
+    axes.plot(*robot[-1], "s", color=PATH, ms=6, zorder=6, label="end")
+
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
+    axes.grid(color="#e6e9ec", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.set_xlabel("x, metres")
+    axes.set_ylabel("y, metres")
+    axes.set_title(title, loc="left", fontsize=10)
+    figure.legend(loc="outside right upper", frameon=False, fontsize=9)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    _save(figure, path)
+
+
+def draw_images(
+    path: Path,
+    title: str,
+    names: list[str],
+    images: list[np.ndarray],
+    floor: list[np.ndarray],
+    other: list[np.ndarray],
+) -> None:
+    """Draw the segments of a few images in two colours, as a PNG.
+
+    **Arguments:**
+    - `images`: grey, undistorted.
+    - `floor`, `other`: [S, 2, 2] end points for each image, pixels.
+    """
+    from matplotlib.lines import Line2D
+
+    columns = min(len(images), 3)
+    rows = -(-len(images) // columns)
+    height, width = images[0].shape
+    figure, grid = _figure((4.2 * columns, 4.2 * rows * height / width + 0.8), rows, columns)
+    for axes in np.ravel(grid):
+        axes.set_axis_off()
+    panels = zip(np.ravel(grid), names, images, floor, other, strict=False)
+    for axes, name, image, on, off in panels:
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+        lines = _collection(axes)
+        lines(off, OTHER, 1.4, None, 2)
+        lines(on, "#2ecc40", 1.8, None, 3)
+        axes.set_title(f"{name}: {len(on)} floor, {len(off)} not", fontsize=8)
+    handles = [
+        Line2D([], [], color="#2ecc40", lw=2, label="moves as the floor does"),
+        Line2D([], [], color=OTHER, lw=2, label="does not, or cannot tell"),
+    ]
+    figure.suptitle(title, fontsize=10)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    _save(figure, path)
+
+
+def _figure(size: tuple[float, float], rows: int = 1, columns: int = 1):
+    """A figure of its own, apart from pyplot's and the user's."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns)
+
+
+def _collection(axes):
+    from matplotlib.collections import LineCollection
+
+    def lines(segments, color, width, label, zorder):
+        axes.add_collection(
+            LineCollection(
+                list(segments), colors=color, linewidths=width, label=label, zorder=zorder,
+                capstyle="round",
+            ),
+            autolim=False,
+        )  # fmt: skip
+
+    return lines
+
+
+def _bounds(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of what is drawn, with a margin; never without an extent."""
+    points = np.concatenate([np.reshape(part, (-1, 2)) for part in parts])
+    low, high = points.min(0), points.max(0)
+    margin = np.maximum(0.04 * (high - low).max(), 0.2)
+    return low - margin, high + margin
+
+
+def _save(figure, path: Path) -> None:
+    beside = path.with_name(f".{path.name}.part")
+    try:
+        figure.savefig(
+            beside, dpi=150, format="png", bbox_inches="tight", metadata={"Software": "sofjax"}
+        )
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
