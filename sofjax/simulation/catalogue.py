@@ -129,12 +129,12 @@ def _random(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
     steps = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
     nodes, travelled, target = [at], 0.0, rng.uniform(30, 60)
     while travelled < target:
-        turn = rng.choice([-1, 0, 1], p=[0.35, 0.3, 0.35])
-        step = steps[(heading + turn) % 4]
-        if not (0 <= at + step).all() or not (at + step < 5).all():
-            heading = (heading + rng.choice([-1, 1])) % 4  # look another way at the lattice's edge
+        ahead = [t for t in (-1, 0, 1) if _on_lattice(at + steps[(heading + t) % 4])]
+        if not ahead:
+            heading += 1
             continue
-        heading = (heading + turn) % 4
+        heading = (heading + rng.choice(ahead)) % 4
+        step = steps[heading]
         travelled += abs(xs[at[0] + step[0]] - xs[at[0]]) + abs(ys[at[1] + step[1]] - ys[at[1]])
         at = at + step
         nodes.append(at)
@@ -144,6 +144,10 @@ def _random(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
     legs = _straight_runs(np.concatenate([np.stack([way[:-1], way[1:]], axis=1), side]))
     corridors = np.concatenate([around(leg, width) for leg in legs])
     return corridors, _corners(way), str(rng.choice(sorted(FLOORS)))
+
+
+def _on_lattice(node: np.ndarray) -> bool:
+    return bool((node >= 0).all() and (node < 5).all())
 
 
 def _straight_runs(legs: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "m 2 2"]:

@@ -1,0 +1,272 @@
+"""Camera images of a world: every ray of every pixel looks its colour up in the atlas.
+
+This module alone of the simulator uses OpenCV. Rays leave through the lens as it is, distortion
+and all, six to a pixel, and end at the nearest of floor, ceiling, walls and boxes: so what hides
+what, and where an edge lies, is exact.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Float32, UInt8
+
+from sofjax.io.camera_file import CameraFile
+from sofjax.io.errors import InputError
+from sofjax.simulation.atlas import Atlas, paint_atlas
+from sofjax.simulation.worlds import World
+
+# Where the rays of a pixel pass through it: no two in one row or column, so that edges along
+# either axis are smoothed in six steps.
+RAYS = (np.array([[0, 3], [1, 0], [2, 4], [3, 1], [4, 5], [5, 2]]) - 2.5) / 6
+NEAR_FLOOR = 4.0  # metres along the view; beyond, the floor's coarse picture is used
+MIRROR_TEXELS = 20.0  # per metre, of the lamps as the floor mirrors them
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """What a cheap camera does to a picture."""
+
+    noise: float = 2.5  # grey values of 255, standard deviation at middle grey
+    blur: float = 0.55  # pixels, standard deviation of the lens's blur
+    exposure_time: float = 0.008  # seconds, for the blur of turning
+    brightness: float = 105.0  # grey value that the automatic exposure aims at
+    hunting: float = 0.06  # share by which it sways
+    adaptation: float = 1.0  # seconds that it takes to follow
+    vignetting: float = 0.15  # share of light lost in the corners
+
+
+class Artist:
+    """Draws one world as one camera sees it."""
+
+    def __init__(self, world: World, camera_file: CameraFile, imaging: Imaging, seed: int = 0):
+        self._world = world
+        self._imaging = imaging
+        self._camera = camera_file.camera
+        self._atlas = paint_atlas(world, seed)
+        self._rays = jnp.asarray(lens_rays(camera_file), jnp.float32)
+        self._mirror = _mirrored_lamps(world)
+        self._vignette = _vignette(self._camera.width, self._camera.height, imaging.vignetting)
+        self._rng = np.random.default_rng([seed, 23])
+        self._phase = self._rng.uniform(0, 2 * np.pi, 2)
+        self._exposure, self._exposed_at = 0.0, 0.0
+
+    def draw(
+        self,
+        R_world_camera: Float[np.ndarray, "3 3"],
+        C: Float[np.ndarray, "3"],
+        stamp: float,
+        turn_rate: float = 0.0,
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """One image, blue, green, red; stamps go up from call to call.
+
+        **Arguments:**
+        - `R_world_camera`, `C`: pose of the camera, metres.
+        - `stamp`: seconds; `turn_rate`: radians per second, for the blur.
+        """
+        faces, tops = _in_view(self._atlas, R_world_camera, C)
+        scene = _scene(self._world, self._atlas, C)
+        columns, rows, gleam = cast(
+            self._rays, jnp.asarray(R_world_camera, jnp.float32), scene, faces, tops
+        )
+        height, width = self._camera.height, self._camera.width
+        shape = (len(RAYS) * height, width)
+        colours = cv2.remap(
+            self._atlas.image,
+            np.asarray(columns).reshape(shape),
+            np.asarray(rows).reshape(shape),
+            cv2.INTER_LINEAR,
+        )
+        image = colours.reshape(len(RAYS), height, width, 3).sum(0, dtype=np.uint16).astype(np.float32)
+        image *= np.float32(1 / len(RAYS))
+        mirrored = self._mirrored(gleam)
+        image += mirrored[..., None]
+        return self._develop(image, stamp, turn_rate)
+
+    def _mirrored(self, gleam: tuple[Array, Array, Array]) -> Float32[np.ndarray, "height width"]:
+        """Light of the lamps in the floor, grey values."""
+        shape = (self._camera.height, self._camera.width)
+        columns, rows, strength = (np.asarray(v).reshape(shape) for v in gleam)
+        lamps = cv2.remap(self._mirror, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return lamps * strength * np.float32(255)
+
+    def _develop(self, image: np.ndarray, stamp: float, turn_rate: float) -> np.ndarray:
+        """Exposure, blur, noise and rounding."""
+        image *= self._vignette * self._expose(float(image.mean()), stamp)
+        focal = float(self._camera.K[0, 0])
+        smear = abs(turn_rate) * self._imaging.exposure_time * focal
+        sigma_y = max(self._imaging.blur, 0.05)
+        sigma_x = float(np.hypot(sigma_y, smear / np.sqrt(12)))
+        image = cv2.GaussianBlur(image, (0, 0), sigmaX=sigma_x, sigmaY=sigma_y)
+        if self._imaging.noise > 0:
+            image += self._noise(image.shape) * np.sqrt((image + 20) / 148)
+        return cv2.cvtColor(np.clip(image + 0.5, 0, 255).astype(np.uint8), cv2.COLOR_RGB2BGR)
+
+    def _expose(self, mean: float, stamp: float) -> np.float32:
+        """The gain of an automatic exposure that follows the picture late, and sways."""
+        wanted = np.clip(self._imaging.brightness / max(mean, 1.0), 0.3, 4.0)
+        late = np.exp(-abs(stamp - self._exposed_at) / self._imaging.adaptation)
+        self._exposure = wanted + (late * (self._exposure - wanted) if self._exposure > 0 else 0.0)
+        self._exposed_at = stamp
+        sway = np.sin(0.9 * stamp + self._phase[0]) + 0.5 * np.sin(2.3 * stamp + self._phase[1])
+        return np.float32(self._exposure * (1 + self._imaging.hunting * sway / 1.5))
+
+    def _noise(self, shape: tuple[int, ...]) -> Float32[np.ndarray, "height width 3"]:
+        draws = self._rng.standard_normal((*shape[:2], 2), np.float32) * np.float32(self._imaging.noise)
+        grey, tint = draws[..., :1], draws[..., 1:]
+        return np.concatenate([grey, grey + 0.3 * tint, grey - 0.3 * tint], axis=-1)
+
+
+def lens_rays(camera_file: CameraFile) -> Float[np.ndarray, "3 rays"]:
+    """Directions in the camera frame, depth 1, of `RAYS` of every pixel of the image as taken.
+
+    **Raises:** `InputError` if the lens bends the image over itself inside the picture.
+    """
+    camera = camera_file.camera
+    K, distortion = np.asarray(camera.K, float), camera_file.distortion
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = (RAYS[:, None] + np.stack([x.ravel(), y.ravel()], axis=-1)).reshape(-1, 1, 2)
+    if camera_file.distortion_model == "equidistant":
+        undistorted = cv2.fisheye.undistortPoints(pixels, K, distortion)
+        again = cv2.fisheye.distortPoints(undistorted, K, distortion)
+    else:
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-4)
+        undistorted = cv2.undistortPoints(pixels, K, distortion, criteria=stop)
+        solid = np.concatenate([undistorted, np.ones((len(undistorted), 1, 1))], axis=-1)
+        again = cv2.projectPoints(solid, np.zeros(3), np.zeros(3), K, distortion)[0]
+    wrong = np.linalg.norm((again - pixels).reshape(-1, 2), axis=1).max()
+    if not wrong < 0.05:
+        raise InputError(
+            f"the distortion {', '.join(f'{v:g}' for v in distortion)} folds the image over itself; "
+            "its coefficients must keep straight lines apart up to the corners"
+        )
+    directions = undistorted.reshape(-1, 2)
+    return np.concatenate([directions, np.ones((len(directions), 1))], axis=1).T
+
+
+def _in_view(
+    atlas: Atlas, R_world_camera: np.ndarray, C: np.ndarray
+) -> tuple[Float[Array, "faces 10"], Float[Array, "tops 7"]]:
+    """Faces and tops that the camera may see, as the rows that `cast` takes."""
+    faces, tops = atlas.faces, atlas.tops
+    foot, ahead = C[:2], R_world_camera[:2, 2]
+    to_start = faces.start - foot
+    normal = np.stack([-faces.along[:, 1], faces.along[:, 0]], axis=-1)
+    distance = -(to_start * normal).sum(1)  # of the camera in front of the face
+    ends = np.stack([to_start, to_start + faces.length[:, None] * faces.along], axis=1)
+    seen = (distance > 1e-3) & ((ends @ ahead).max(1) > -2.0)
+    g = -normal / np.where(seen, distance, 1)[:, None]  # 1 / depth of the face along d is g·d
+    s0 = -(to_start * faces.along).sum(1)
+    face_rows = np.column_stack(
+        [g, faces.along, s0, faces.length, faces.height, faces.origin, np.ones(len(s0))]
+    )[seen]
+    below = tops.height < C[2]
+    rise = np.where(below, C[2] - tops.height, 1)
+    top_rows = np.column_stack([1 / rise, tops.rect - np.tile(foot, 2), tops.origin])[below]
+    return _padded(face_rows, 8), _padded(top_rows, 4)
+
+
+def _padded(rows: np.ndarray, multiple: int) -> Array:
+    """Rows of zeros added, so that only few lengths occur and `cast` is seldom compiled."""
+    short = -len(rows) % multiple
+    return jnp.asarray(np.pad(rows, ((0, short), (0, 0))), jnp.float32)
+
+
+def _scene(world: World, atlas: Atlas, C: np.ndarray) -> Float[Array, "16"]:
+    """The numbers of a frame that all rays share."""
+    low = world.corridors[:, :2].min(0)
+    numbers = [*C, world.ceiling, atlas.texels, world.look.gloss, *low]
+    for picture in (atlas.floor, atlas.far_floor, atlas.ceiling):
+        numbers += [*picture.origin, picture.texels]
+    return jnp.asarray(numbers, jnp.float32)
+
+
+@partial(jax.jit)
+def cast(
+    rays: Float32[Array, "3 rays"],
+    R_world_camera: Float32[Array, "3 3"],
+    scene: Float32[Array, "numbers"],
+    faces: Float32[Array, "faces 10"],
+    tops: Float32[Array, "tops 7"],
+) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+    """Where each ray ends, as column and row of the atlas.
+
+    Nearness, the inverse of the distance along a ray, is affine in its direction for every plane,
+    so the nearest surface is found without a division.
+
+    **Returns:** columns and rows of the atlas [rays]; and for the first ray of every pixel column,
+    row and strength of the lamps that it sees mirrored.
+    """
+    x, y, height, ceiling, texels, gloss, low_x, low_y = scene[:8]
+    dx, dy, dz = R_world_camera @ rays
+    nearest = jnp.zeros_like(dx)  # nearness of the nearest face
+    along = jnp.zeros_like(dx)  # nearness × metres along the face
+    column0, row0 = jnp.zeros_like(dx), jnp.zeros_like(dx)
+    for i in range(faces.shape[0]):
+        gx, gy, ux, uy, s0, length, top, column, row, exists = faces[i]
+        near = gx * dx + gy * dy
+        s = s0 * near + ux * dx + uy * dy
+        inside = (s >= 0) & (s <= length * near) & (dz <= (top - height) * near)
+        closer = inside & (near > nearest) & (exists > 0)
+        nearest = jnp.where(closer, near, nearest)
+        along = jnp.where(closer, s, along)
+        column0, row0 = jnp.where(closer, column, column0), jnp.where(closer, row, row0)
+    is_top = jnp.zeros_like(dx, bool)
+    for i in range(tops.shape[0]):
+        inverse_rise, x0, y0, x1, y1, column, row = tops[i]
+        near = -dz * inverse_rise
+        inside = (dx >= x0 * near) & (dx <= x1 * near) & (dy >= y0 * near) & (dy <= y1 * near)
+        closer = inside & (near > nearest) & (inverse_rise > 0)
+        nearest = jnp.where(closer, near, nearest)
+        column0, row0 = jnp.where(closer, column, column0), jnp.where(closer, row, row0)
+        is_top = is_top | closer
+
+    floor, above = -dz / height, dz / (ceiling - height)
+    level = jnp.maximum(floor, above)
+    on_face = nearest >= level
+    distance = 1 / jnp.maximum(jnp.where(on_face, nearest, level), 1e-4)
+    floor_column, floor_row, floor_texels = scene[8:11]
+    far_column, far_row, far_texels = scene[11:14]
+    ceiling_column, ceiling_row, ceiling_texels = scene[14:17]
+    is_floor, is_near = dz < 0, distance < NEAR_FLOOR
+
+    def level_picture(near: Array, far: Array, over: Array) -> Array:
+        return jnp.where(is_floor, jnp.where(is_near, near, far), over)
+
+    px, py, pz = x + distance * dx, y + distance * dy, height + distance * dz
+    scale = level_picture(floor_texels, far_texels, ceiling_texels)
+    level_columns = level_picture(floor_column, far_column, ceiling_column) + scale * px
+    level_rows = level_picture(floor_row, far_row, ceiling_row) + scale * py
+    face_columns = column0 + texels * jnp.where(is_top, px, along * distance)
+    face_rows = row0 + texels * jnp.where(is_top, py, pz)
+    columns = jnp.where(on_face, face_columns, level_columns)
+    rows = jnp.where(on_face, face_rows, level_rows)
+
+    first = rays.shape[1] // len(RAYS)
+    dx, dy, dz, nearest, floor = (v[:first] for v in (dx, dy, dz, nearest, floor))
+    reach = (1 + ceiling / height) / jnp.maximum(floor, 1e-4)  # to the mirrored ceiling
+    grazing = 1 + dz / jnp.sqrt(dx * dx + dy * dy + dz * dz)
+    mirrors = (floor > nearest) & (nearest * reach < 1)
+    strength = jnp.where(mirrors, gloss * grazing**4, 0)
+    mirror_column = (x + reach * dx - low_x) * MIRROR_TEXELS - 0.5
+    mirror_row = (y + reach * dy - low_y) * MIRROR_TEXELS - 0.5
+    return columns, rows, (mirror_column, mirror_row, strength)
+
+
+def _mirrored_lamps(world: World) -> Float32[np.ndarray, "rows columns"]:
+    """The lamps as a floor that is not quite smooth mirrors them, 0 to 1."""
+    low, high = world.corridors[:, :2].min(0), world.corridors[:, 2:].max(0)
+    columns, rows = np.ceil((high - low) * MIRROR_TEXELS).astype(int)
+    lamps = np.zeros((rows, columns), np.float32)
+    for lamp, light in zip(world.lamps, world.lamp_light, strict=True):
+        x0, y0, x1, y1 = np.round((lamp - np.tile(low, 2)) * MIRROR_TEXELS).astype(int)
+        lamps[y0:y1, x0:x1] = light
+    return cv2.GaussianBlur(lamps, (0, 0), 0.06 * MIRROR_TEXELS)
+
+
+def _vignette(width: int, height: int, loss: float) -> Float32[np.ndarray, "height width 1"]:
+    x, y = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
+    return (1 - loss * (x**2 + y**2) / 2)[..., None].astype(np.float32)
