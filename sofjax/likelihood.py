@@ -21,10 +21,11 @@ class SensorModel(eqx.Module):
     """Gaussian noise of an observed segment in (rho, theta), and the cost of one that fits nothing."""
 
     propagate: bool = eqx.field(static=True, default=True)  # or the paper's constant sigmas
-    pixel_sigma: float = 0.3  # pixels, of an end point across its segment
-    tilt_sigma: float = 0.002  # radians, wobble of pitch and of roll from image to image
+    pixel_sigma: float = 0.5  # pixels, of an end point across its segment
+    tilt_sigma: float = 0.001  # radians, wobble of pitch and of roll from image to image
     rho_sigma: float = 0.02  # metres; the constant sigmas, and with `propagate` ...
     theta_sigma: float = 0.02  # radians; ... unused
+    theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
     e_max: float = 9.0  # cost of an observed segment that matches nothing
 
 
@@ -84,6 +85,7 @@ def sight(
         constant = jnp.array([sensor.rho_sigma, sensor.theta_sigma]) ** 2
         covariance = jnp.broadcast_to(jnp.diag(constant), covariance.shape)
         tilt = jnp.zeros_like(tilt)
+    some = some & (covariance[:, 1, 1] < sensor.theta_limit**2)
     # what is reported at the nominal tilt moves against the correction
     return Sightings(endpoints, some & segments_image.valid, line, covariance, -tilt)
 

@@ -16,13 +16,13 @@ class MotionModel(eqx.Module):
     and a turn in radians per metre driven; a prior of zero switches one off.
     """
 
-    distance_noise: float = 0.01  # metres per sqrt(metre)
-    lateral_noise: float = 0.003  # metres per sqrt(metre)
-    heading_noise: float = 0.01  # radians per sqrt(metre)
-    turn_noise: float = 0.02  # radians per sqrt(radian)
-    distance_scale_sigma: float = 0.03
-    turn_scale_sigma: float = 0.10
-    curvature_sigma: float = 0.01  # radians per metre
+    distance_noise: float = 0.005  # metres per sqrt(metre)
+    lateral_noise: float = 0.002  # metres per sqrt(metre)
+    heading_noise: float = 0.005  # radians per sqrt(metre)
+    turn_noise: float = 0.01  # radians per sqrt(radian)
+    distance_scale_sigma: float = 0.02
+    turn_scale_sigma: float = 0.05
+    curvature_sigma: float = 0.005  # radians per metre
     bias_drift: float = 0.02  # share of its prior that a systematic error wanders in sqrt(metre)
 
 

@@ -32,8 +32,11 @@ class MapRules(eqx.Module):
     merge_angle: float = 0.035  # radians
     join_gap: float = 0.3  # metres between two pieces of one line
     kappa_sigma: float = 0.3  # prior of a line that does not lie on the floor
-    kappa_min: float = 0.03  # a magnification nearer to 1 is taken for floor
+    kappa_above: float = 1.04  # a magnification between these two is taken for floor: nothing ...
+    kappa_below: float = 0.7  # ... lies little under a floor, and reflections lie deep
     kappa_gate: float = 4.0  # standard deviations from 1 that tell a line from the floor
+    kappa_known: float = 0.1  # standard deviation below which a line may be one of the final map
+    correlation: float = 1.0  # sightings in a row that count as one: their errors hang together
     rho_drift: float = 0.002  # metres: no map line is known better than ...
     theta_drift: float = 0.002  # ... this, radians
     forget: int = 50  # steps unseen after which a line of few sightings is dropped
@@ -69,10 +72,13 @@ def empty_map(rules: MapRules) -> SegmentMap:
     )
 
 
-def is_raised(rules: MapRules, line: Float[Array, "3"], covariance: Float[Array, "3 3"]) -> Bool[Array, ""]:
+def is_raised(
+    rules: MapRules, line: Float[Array, "3"], covariance: Float[Array, "3 3"]
+) -> Bool[Array, ""]:
     """Whether all views of a line together say that it does not lie on the floor."""
-    away = jnp.abs(line[2] - 1)
-    return rules.classify & (away > rules.kappa_min) & (away > rules.kappa_gate * safe_sqrt(covariance[2, 2]))
+    kappa, sigma = line[2], safe_sqrt(covariance[2, 2])
+    outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
+    return rules.classify & outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
 
 
 def believed(
@@ -196,7 +202,7 @@ def _update(rules, sensor, m, sightings, slot, known, tilt, T_world_foot):
     lines = PolarLine(seen[:, 0], seen[:, 1])
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
     tilting = sensor.tilt_sigma**2 * sightings.tilt @ jnp.swapaxes(sightings.tilt, 1, 2)
-    W = _inverse2(sightings.covariance + drift + 0.1 * tilting)
+    W = _inverse2(sightings.covariance + drift + 0.1 * tilting) / rules.correlation
     at = jnp.minimum(slot, K - 1)
     innovation = polar_difference(observed, PolarLine(lines.rho[at], lines.theta[at]))
     W_line = sum_by_line(W)
@@ -214,8 +220,9 @@ def _update(rules, sensor, m, sightings, slot, known, tilt, T_world_foot):
         PHt = m.covariance @ jnp.swapaxes(H, 1, 2)
         gain = PHt @ W_line @ _inverse2(jnp.eye(2) + H @ PHt @ W_line)
         line = m.line + (gain @ mean[..., None])[..., 0]
-        covariance = m.covariance - gain @ H @ m.covariance
-        covariance = (covariance + jnp.swapaxes(covariance, 1, 2)) / 2
+        rest = jnp.eye(3) - gain @ H  # Joseph's form stays positive in float32
+        noise = jnp.where(touched[:, None, None], _inverse2(jnp.where(touched[:, None, None], W_line, jnp.eye(2))), 0)
+        covariance = rest @ m.covariance @ jnp.swapaxes(rest, 1, 2) + gain @ noise @ jnp.swapaxes(gain, 1, 2)
         anchor = m.anchor
 
     keep = lambda a, b: jax.tree.map(

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sofjax.association import Association
+from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
@@ -65,6 +66,7 @@ class StepInfo(eqx.Module):
     effective_size: Float[Array, "*batch"]
     log_evidence: Float[Array, "*batch"]  # log of the mean likelihood of the particles
     tilt: Float[Array, "*batch 2"]  # wobble (pitch, roll) of the moment, radians
+    misfit: Float[Array, "*batch"]  # mean error e of the matched segments; 2 if sigmas are true
     detected: Int[Array, "*batch"]
     below_horizon: Int[Array, "*batch"]  # on the floor's side of the horizon and within range
     associated: Int[Array, "*batch"]  # by eq. (9)
@@ -163,6 +165,7 @@ def step(
         effective_size=size,
         log_evidence=log_evidence,
         tilt=best.tilt,
+        misfit=jnp.where(known, best.error, 0).sum() / jnp.maximum(known.sum(), 1),
         detected=detected.sum(),
         below_horizon=sightings.valid.sum(),
         associated=is_sof.sum(),
@@ -224,11 +227,12 @@ def final_map(config: SlamConfig, mount: Mount, segment_map: SegmentMap) -> Fina
     rules = config.segment_map
     raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, segment_map.line, segment_map.covariance)
     often = segment_map.updates >= rules.min_updates
-    kappa = segment_map.line[:, 2]
+    kappa, sigma = segment_map.line[:, 2], safe_sqrt(segment_map.covariance[:, 2, 2])
+    known = ~jnp.asarray(rules.classify) | (sigma < rules.kappa_known)
     return FinalMap(
         endpoints_world=segment_map.segments_world.endpoints,
-        is_floor=segment_map.valid & often & ~raised,
+        is_floor=segment_map.valid & often & known & ~raised,
         updates=segment_map.updates,
         height=mount.height * (1 - 1 / kappa),
-        height_sigma=mount.height * jnp.sqrt(segment_map.covariance[:, 2, 2]) / kappa**2,
+        height_sigma=mount.height * sigma / kappa**2,
     )
