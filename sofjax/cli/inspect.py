@@ -120,7 +120,8 @@ def draw(out: Path, drive: "Drive", frontend: "Frontend") -> None:
     poses = SE2(jnp.asarray(at.xy, float), jnp.asarray(at.yaw, float))
     extract = eqx.filter_jit(extract)
     names, images, floor, other = [], [], [], []
-    for i in np.linspace(0, len(at.stamps) - 1, SHOWN + 2).round().astype(int)[1:-1]:
+    spread = np.linspace(0, len(at.stamps) - 1, SHOWN + 2).round()[1:-1]
+    for i in np.unique(spread.astype(int)).tolist():
         image = read_image(drive.image_files[i])
         partner = _partner(at, i, config.baseline_distance, config.baseline_angle)
         second, first = (frontend.view(drive.image_files[k]) for k in (i, partner))

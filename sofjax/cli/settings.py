@@ -11,6 +11,19 @@ from sofjax.vision import DETECTORS, FrontendSettings
 
 FRONTENDS = {"paper": FrontendSettings(detector="hough")}  # of a preset; the default otherwise
 
+CHOICES = {
+    "frontend.detector": tuple(DETECTORS),
+    "filter.choice": ("resample", "winner"),
+    "segment_map.rule": ("kalman", "gamma"),
+}
+LIMITS = {
+    "seed": (0, 2**32 - 1),
+    "frontend.capacity": (1, 4096),
+    "filter.particles": (1, 1_000_000),
+    "segment_map.capacity": (8, 65_536),
+    "segment_map.candidates": (1, 8),
+}
+
 
 @dataclasses.dataclass(frozen=True)
 class RunSettings:
@@ -68,19 +81,14 @@ def _pairs(sets: list[str]) -> dict[str, object]:
 
 
 def check(settings: RunSettings, where: str) -> None:
-    """Refuse numbers that no run can use."""
+    """Refuse what no run can use, before anything is compiled for it."""
     for name, value in to_dict(settings).items():
-        if not isinstance(value, str) and value < 0:
+        if name in CHOICES:
+            if value not in CHOICES[name]:
+                right = " or ".join(CHOICES[name])
+                raise InputError(f"{where}: '{name}' is '{value:.40}'; it must be {right}")
+        elif value < 0:
             raise InputError(f"{where}: '{name}' is {value}; it must not be negative")
-    least = {"filter.particles": (1, 1_000_000), "frontend.capacity": (1, 4096)}
-    for name, (low, high) in least.items():
-        value = to_dict(settings)[name]
-        if not low <= value <= high:
+        elif name in LIMITS and not LIMITS[name][0] <= value <= LIMITS[name][1]:
+            low, high = LIMITS[name]
             raise InputError(f"{where}: '{name}' is {value}; it must be from {low} to {high}")
-    if settings.seed >= 2**32:
-        raise InputError(f"{where}: 'seed' is {settings.seed}; it must be below 2^32")
-    if settings.frontend.detector not in DETECTORS:
-        raise InputError(
-            f"{where}: 'frontend.detector' is '{settings.frontend.detector}'; it must be "
-            f"{' or '.join(DETECTORS)}"
-        )

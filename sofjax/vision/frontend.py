@@ -111,4 +111,4 @@ def pack(
     endpoints = np.zeros((capacity, 2, 2), np.float32)
     endpoints[: len(kept)] = kept.reshape(-1, 2, 2)
     valid = np.arange(capacity) < len(kept)
-    return Segments(jnp.asarray(endpoints), jnp.asarray(valid)), len(segments) - len(kept)
+    return Segments(jnp.asarray(endpoints, float), jnp.asarray(valid)), len(segments) - len(kept)

@@ -17,11 +17,10 @@ def observation(view: View, motion: np.ndarray) -> Observation:
     - `view`: the image's segments.
     - `motion`: [3], T_previous_current of the odometer as (dx, dy, dyaw), metres and radians.
     """
-    motion = np.asarray(motion, np.float32)
     return Observation(
         segments_image=view.segments_image,
-        motion=SE2(jnp.asarray(motion[:2]), jnp.asarray(motion[2])),
-        overflow=jnp.asarray(view.overflow, jnp.int32),
+        motion=SE2(jnp.asarray(motion[:2], float), jnp.asarray(motion[2], float)),
+        overflow=jnp.asarray(view.overflow, int),
     )
 
 
