@@ -6,7 +6,6 @@ what, and where an edge lies, is exact.
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import jax
@@ -23,6 +22,7 @@ from sofjax.simulation.worlds import World
 # either axis are smoothed in six steps.
 RAYS = (np.array([[0, 3], [1, 0], [2, 4], [3, 1], [4, 5], [5, 2]]) - 2.5) / 6
 NEAR_FLOOR = 4.0  # metres along the view; beyond, the floor's coarse picture is used
+SPREAD = (0.65, 0.8, 1.0, 1.25, 1.55)  # of a rough floor's mirrored rays, drawn out along the view
 MIRROR_TEXELS = 20.0  # per metre, of the lamps as the floor mirrors them
 
 
@@ -88,10 +88,11 @@ class Artist:
 
     def _mirrored(self, gleam: tuple[Array, Array, Array]) -> Float32[np.ndarray, "height width"]:
         """Light of the lamps in the floor, grey values."""
-        shape = (self._camera.height, self._camera.width)
-        columns, rows, strength = (np.asarray(v).reshape(shape) for v in gleam)
+        height, width = self._camera.height, self._camera.width
+        columns, rows = (np.asarray(v).reshape(len(SPREAD) * height, width) for v in gleam[:2])
+        strength = np.asarray(gleam[2]).reshape(height, width)
         lamps = cv2.remap(self._mirror, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return lamps * strength * np.float32(255)
+        return lamps.reshape(len(SPREAD), height, width).mean(0) * strength * np.float32(255)
 
     def _develop(self, image: np.ndarray, stamp: float, turn_rate: float) -> np.ndarray:
         """Exposure, blur, noise and rounding."""
@@ -175,7 +176,7 @@ def _padded(rows: np.ndarray, multiple: int) -> Array:
     return jnp.asarray(np.pad(rows, ((0, short), (0, 0))), jnp.float32)
 
 
-def _scene(world: World, atlas: Atlas, C: np.ndarray) -> Float[Array, "16"]:
+def _scene(world: World, atlas: Atlas, C: np.ndarray) -> Float[Array, "17"]:
     """The numbers of a frame that all rays share."""
     low = world.corridors[:, :2].min(0)
     numbers = [*C, world.ceiling, atlas.texels, world.look.gloss, *low]
@@ -184,7 +185,7 @@ def _scene(world: World, atlas: Atlas, C: np.ndarray) -> Float[Array, "16"]:
     return jnp.asarray(numbers, jnp.float32)
 
 
-@partial(jax.jit)
+@jax.jit
 def cast(
     rays: Float32[Array, "3 rays"],
     R_world_camera: Float32[Array, "3 3"],
@@ -197,8 +198,8 @@ def cast(
     Nearness, the inverse of the distance along a ray, is affine in its direction for every plane,
     so the nearest surface is found without a division.
 
-    **Returns:** columns and rows of the atlas [rays]; and for the first ray of every pixel column,
-    row and strength of the lamps that it sees mirrored.
+    **Returns:** columns and rows of the atlas [rays]; and for the first ray of every pixel the columns
+    and rows [SPREAD, pixels] of the lamps that it sees mirrored, and how strongly.
     """
     x, y, height, ceiling, texels, gloss, low_x, low_y = scene[:8]
     dx, dy, dz = R_world_camera @ rays
@@ -250,10 +251,11 @@ def cast(
     reach = (1 + ceiling / height) / jnp.maximum(floor, 1e-4)  # to the mirrored ceiling
     grazing = 1 + dz / jnp.sqrt(dx * dx + dy * dy + dz * dz)
     mirrors = (floor > nearest) & (nearest * reach < 1)
-    strength = jnp.where(mirrors, gloss * grazing**4, 0)
-    mirror_column = (x + reach * dx - low_x) * MIRROR_TEXELS - 0.5
-    mirror_row = (y + reach * dy - low_y) * MIRROR_TEXELS - 0.5
-    return columns, rows, (mirror_column, mirror_row, strength)
+    strength = jnp.where(mirrors, gloss * (0.1 + 0.9 * grazing**3), 0)
+    spread = [reach * share for share in SPREAD]
+    mirror_columns = jnp.stack([(x + r * dx - low_x) * MIRROR_TEXELS - 0.5 for r in spread])
+    mirror_rows = jnp.stack([(y + r * dy - low_y) * MIRROR_TEXELS - 0.5 for r in spread])
+    return columns, rows, (mirror_columns, mirror_rows, strength)
 
 
 def _mirrored_lamps(world: World) -> Float32[np.ndarray, "rows columns"]:

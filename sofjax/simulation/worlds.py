@@ -126,7 +126,7 @@ class World:
         found = _Found()
         for lamp, light in zip(self.lamps, self.lamp_light, strict=True):
             for edge in outline(lamp):
-                found.add("reflection", on_plane(edge, -self.ceiling), self.look.gloss * light)
+                found.add("reflection", on_plane(edge, -self.ceiling), 0.1 * self.look.gloss * light)
         return found.segments()
 
     def _foot_brightness(self, wall: int) -> float:
