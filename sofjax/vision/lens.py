@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 
 from sofjax.io.camera_file import CameraFile
+from sofjax.io.errors import InputError
 
 SAMPLES = 33  # points of a segment that are looked up in the mask of what the lens saw
 MARGIN = 3  # pixels by which a detector's smoothing reaches over the edge of that
@@ -22,6 +23,11 @@ class Lens:
         exact = make(self.K, self.distortion, np.eye(3), self.K, size, cv2.CV_32FC1)
         self._maps = cv2.convertMaps(*exact, cv2.CV_16SC2)
         self.seen = _seen(*exact)
+        if self.seen.mean() < 0.05:
+            raise InputError(
+                f"camera '{camera_file.name}': its 'distortion_coefficients' leave nothing of the "
+                f"image; they must be those of the model {camera_file.distortion_model}"
+            )
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
         """The undistorted image, of the same size; beyond what the lens saw, its edge goes on."""
@@ -55,8 +61,9 @@ def _seen(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     mirrored: the determinant of the map's Jacobian tells, and what is joined to the middle stays.
     """
     height, width = x.shape
-    (x_v, x_u), (y_v, y_u) = np.gradient(x), np.gradient(y)
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    x, y = np.where(inside, x, -1e4), np.where(inside, y, -1e4)  # neither infinite nor no number
+    (x_v, x_u), (y_v, y_u) = np.gradient(x), np.gradient(y)
     valid = (inside & (x_u * y_v > x_v * y_u)).astype(np.uint8)
     if valid.all():
         return valid.astype(bool)
