@@ -6,6 +6,7 @@ what, and where an edge lies, is exact.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import jax
@@ -119,6 +120,14 @@ class Artist:
         draws = self._rng.standard_normal((*shape[:2], 2), np.float32) * np.float32(self._imaging.noise)
         grey, tint = draws[..., :1], draws[..., 1:]
         return np.concatenate([grey, grey + 0.3 * tint, grey - 0.3 * tint], axis=-1)
+
+
+def write_image(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    """Write a JPEG of good quality."""
+    coded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 92])
+    if not coded:
+        raise OSError(None, "the image cannot be coded", str(path))
+    path.write_bytes(data.tobytes())
 
 
 def lens_rays(camera_file: CameraFile) -> Float[np.ndarray, "3 rays"]:

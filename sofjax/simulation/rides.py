@@ -1,0 +1,161 @@
+"""A ride: a robot driven through a world, what was true of it and what its odometer read."""
+
+import math
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from sofjax.geometry import SE2, Camera, Mount
+from sofjax.geometry.camera import rotation_robot_camera, rotation_z
+from sofjax.io.camera_file import CameraFile
+from sofjax.io.errors import InputError
+from sofjax.io.trajectory import Trajectory
+from sofjax.simulation.catalogue import check_way
+from sofjax.simulation.robots import Driver, Odometer, drive_along, increments, read_path
+from sofjax.simulation.worlds import World
+
+
+def paper_camera(
+    height: float = 1.0, pitch: float = math.radians(12), focal: float = 291.0, **mount: float
+) -> CameraFile:
+    """The paper's webcam, 320×240 on top of the robot; metres, radians, pixels. Section IV.A."""
+    K = jnp.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
+    distortion = np.array([-0.09, 0.03, 0.0006, -0.0004, 0.0])
+    camera = Camera(K, 320, 240)
+    placed = Mount.create(height, pitch, **{"x": 0.1, **mount})
+    return CameraFile(camera, placed, distortion, "plumb_bob", "simulated")
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A robot with its camera, its odometer and its driver."""
+
+    camera_file: CameraFile = field(default_factory=paper_camera)
+    driver: Driver = Driver()
+    odometer: Odometer = field(default_factory=Odometer)
+    image_rate: float = 10.0  # images a second
+    odometry_rate: float = 25.0  # readings a second
+    dropped: float = 0.01  # share of the readings that are lost
+    vibration: float = math.radians(0.1)  # radians, of the mount's pitch and roll at full speed
+
+
+def random_rig(seed: int) -> Rig:
+    """A robot unlike others: its camera, the camera's place, and the errors of its odometer."""
+    rng = np.random.default_rng([seed, 37])
+    camera_file = paper_camera(
+        height=float(rng.uniform(0.4, 1.2)),
+        pitch=math.radians(rng.uniform(10, 25)),
+        focal=float(rng.uniform(240, 330)),
+        x=float(rng.uniform(-0.1, 0.3)),
+        y=float(rng.uniform(-0.08, 0.08)),
+        roll=math.radians(rng.normal(0, 0.7)),
+        yaw=math.radians(rng.normal(0, 1.5)),
+    )
+    odometer = Odometer(
+        distance=rng.normal(1, 0.012),
+        left=rng.normal(1.02, 0.035),
+        right=rng.normal(1.02, 0.035),
+        bend=rng.normal(0, 0.003),
+        distance_noise=rng.uniform(0.001, 0.008),
+        heading_noise=rng.uniform(0.001, 0.006),
+        turn_noise=rng.uniform(0.003, 0.02),
+        slip=rng.uniform(0, 0.05),
+    )
+    driver = Driver(speed=float(rng.uniform(0.4, 0.9)), wobble=float(rng.uniform(0.02, 0.1)))
+    return Rig(camera_file, driver, odometer)
+
+
+@dataclass(frozen=True)
+class Ride:
+    """What happened."""
+
+    truth: Trajectory  # at the images
+    turn_rate: np.ndarray  # [T] radians per second, at the images
+    odometry: Trajectory  # as read, in the odometer's own frame
+    mounts: Mount  # leading T: the mount as it shook at each image
+
+    def motions(self) -> SE2:
+        """The odometer's readings between the images, with a leading T: what `observe` takes."""
+        return increments(self.odometry.at(self.truth.stamps))
+
+    def poses(self) -> SE2:
+        """The true T_world_robot at the images, with a leading T."""
+        return SE2(jnp.asarray(self.truth.xy), jnp.asarray(self.truth.yaw))
+
+    def camera_poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """The true R_world_camera [T, 3, 3] and optical centres C [T, 3], metres, at the images."""
+        R_world_camera, C = _camera_pose(self.mounts, self.poses())
+        return np.asarray(R_world_camera, float), np.asarray(C, float)
+
+
+def take_ride(world: World, rig: Rig, seed: int = 0, most_images: int | None = None) -> Ride:
+    """Drive a robot along a world's way.
+
+    **Raises:** `InputError` for a way through a wall, and for a rig that cannot be.
+    """
+    check_rig(world, rig)
+    check_way(world.corridors, world.way)
+    rng = np.random.default_rng([seed, 41])
+    path = drive_along(world.way, rig.driver, rng)
+    stamps = np.arange(0, path.stamps[-1], 1 / rig.image_rate)[:most_images]
+    truth = path.at(stamps)
+    read_at = path.at(np.arange(0, stamps[-1] + 1 / rig.odometry_rate, 1 / rig.odometry_rate))
+    odometry = read_path(rig.odometer, read_at, jax.random.key(seed))
+    kept = rng.random(len(odometry.stamps)) >= rig.dropped
+    kept[[0, -1]] = True
+    odometry = Trajectory(odometry.stamps[kept], odometry.xy[kept], odometry.yaw[kept])
+    before, after = path.at(stamps - 0.02), path.at(stamps + 0.02)
+    speed = np.linalg.norm(after.xy - before.xy, axis=-1) / 0.04
+    shake = rig.vibration * (speed / rig.driver.speed)[:, None] * rng.standard_normal((len(stamps), 2))
+    return Ride(truth, (after.yaw - before.yaw) / 0.04, odometry, _shaken(rig.camera_file.mount, shake))
+
+
+def _shaken(mount: Mount, shake: np.ndarray) -> Mount:
+    """The mount at each image, its pitch and roll moved by `shake` [T, 2] radians."""
+    still = jax.tree.map(lambda value: jnp.broadcast_to(value, (len(shake),)), mount)
+    pitch, roll = jnp.asarray(shake, still.pitch.dtype).T
+    return Mount(still.x, still.y, still.height, still.pitch + pitch, still.roll + roll, still.yaw)
+
+
+def check_rig(world: World, rig: Rig) -> None:
+    """Refuse a robot that cannot be, in a sentence."""
+    height = float(rig.camera_file.mount.height)
+    if not 0 < height < world.ceiling:
+        where = "in or under the floor" if height <= 0 else "above the ceiling"
+        raise InputError(
+            f"a camera {height:g} m high is {where}; it must be between 0 and {world.ceiling:.2f} m"
+        )
+    odometer = rig.odometer
+    for name, value in (
+        ("vibration", rig.vibration),
+        ("share of dropped readings", rig.dropped),
+        ("noise of the odometer's distance", odometer.distance_noise),
+        ("noise of the odometer's heading", odometer.heading_noise),
+        ("noise of the odometer's turns", odometer.turn_noise),
+        ("slips per metre", odometer.slip),
+        ("wobble", rig.driver.wobble),
+    ):
+        if not 0 <= float(value) < math.inf:
+            raise InputError(f"the {name} is {float(value):g}; it must be 0 or more")
+    if rig.dropped > 0.9:
+        raise InputError(f"of the readings a share of {rig.dropped:g} is dropped; at most 0.9 may be")
+    for name, value, unit in (
+        ("speed", rig.driver.speed, "metres a second"),
+        ("turn rate", rig.driver.turn_rate, "radians a second"),
+        ("image rate", rig.image_rate, "images a second"),
+        ("odometry rate", rig.odometry_rate, "readings a second"),
+    ):
+        if not 0 < value < math.inf:
+            raise InputError(f"the {name} is {value:g}; it must be more than 0 {unit}")
+    if rig.driver.speed > 2:
+        raise InputError(f"at {rig.driver.speed:g} m/s a robot cannot take these bends; at most 2 may be")
+
+
+@jax.jit
+@jax.vmap
+def _camera_pose(mount: Mount, T_world_robot: SE2) -> tuple[Array, Array]:
+    C = jnp.append(T_world_robot.apply(mount.T_robot_foot.xy), mount.height)
+    return rotation_z(T_world_robot.yaw) @ rotation_robot_camera(mount), C
