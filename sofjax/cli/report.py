@@ -37,7 +37,7 @@ class Results:
     """What came out, beside the trajectory."""
 
     segments: np.ndarray  # [K, 2, 2], the map's segments on the floor, metres
-    raised: int  # lines that were left out of it for standing above the floor
+    left_out: int  # lines that the filter kept and that are not known to lie on the floor
     interrupted: bool
     warnings: list[str]
     trajectory: TrajectoryErrors | None = None
@@ -64,8 +64,7 @@ def write_results(
         results.segments, seen, height = (
             v[keep] for v in (final.endpoints_world.astype(float), final.updates, final.height)
         )
-        often = final.updates >= settings.slam.segment_map.min_updates
-        results.raised = int((np.asarray(state.segment_map.valid) & often & ~keep).sum())
+        results.left_out = int((np.asarray(state.segment_map.valid) & ~keep).sum())
     write_map(folder / outputs.MAP, results.segments, seen, height)
     motion = _compare(drive, tally, results) if tally.stamps else None
     if not viewer.available():
@@ -133,13 +132,13 @@ def warnings(drive: Drive, tally: Tally) -> list[str]:
             found.append(f"{count} of {n} {text}")
     if tally.overflow:
         found.append(
-            f"{tally.overflow} of {tally.detected} segments found no place in an observation; "
-            "raise frontend.capacity if that is many"
+            f"{tally.overflow} of {tally.detected} segments found no place in an observation (what "
+            "is above the horizon goes first, then the shortest); frontend.capacity makes room"
         )
     if tally.step["map_overflow"]:
         found.append(
             f"the map was full, and {tally.step['map_overflow']} new lines found no place; "
-            "raise segment_map.capacity"
+            "segment_map.capacity makes room"
         )
     return found
 
@@ -172,7 +171,7 @@ def write_report(
                 "born": tally.step["born"],
                 "mapped": len(results.segments),
             },
-            "raised": results.raised,
+            "left_out": results.left_out,
             "overflow": {"segments": tally.overflow, "map": tally.step["map_overflow"]},
             "images": {
                 "listed": len(drive.image_files),
@@ -219,8 +218,8 @@ def summary(
         + f"; interrupted before {len(drive.image_files) - n} more" * results.interrupted,
         f"  segments  {tally.detected} found, {step['below_horizon']} on the floor's side of the "
         f"horizon, {step['associated']} associated, {step['matched']} matched to the map",
-        f"  map       {len(results.segments)} segments on the floor; {results.raised} lines above "
-        "it left out",
+        f"  map       {len(results.segments)} segments on the floor; {results.left_out} lines left "
+        "out, above it or seen too little",
         f"  time      {sum(seconds.values()):.1f} s"
         + (f"; {fps:.0f} frames a second ({stages} ms)" if fps else ""),
     ]
