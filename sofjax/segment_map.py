@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sofjax.geometry.camera import Camera, Mount
+from sofjax.geometry.floor import floor_homography, floor_to_image
 from sofjax.geometry.angles import safe_norm, safe_sqrt, wrap_axial
 from sofjax.geometry.lines import PolarLine, direction, normal, polar_difference, polar_through
 from sofjax.geometry.se2 import SE2
@@ -34,13 +36,14 @@ class MapRules(eqx.Module):
     kappa_sigma: float = 0.3  # prior of a line that does not lie on the floor
     kappa_above: float = 1.04  # a magnification between these two is taken for floor: nothing ...
     kappa_below: float = 0.7  # ... lies little under a floor, and reflections lie deep
-    kappa_gate: float = 4.0  # standard deviations from 1 that tell a line from the floor
-    kappa_known: float = 0.1  # standard deviation below which a line may be one of the final map
+    kappa_gate: float = 3.0  # standard deviations from 1 that tell a line from the floor
+    kappa_known: float = 0.07  # standard deviation below which a line may be one of the final map
     correlation: float = 1.0  # sightings in a row that count as one: their errors hang together
     rho_drift: float = 0.002  # metres: no map line is known better than ...
     theta_drift: float = 0.002  # ... this, radians
     forget: int = 50  # steps unseen after which a line of few sightings is dropped
-    min_updates: int = 5  # sightings that make a line one of the final map
+    min_updates: int = 5  # sightings that make a line one of the final map, ...
+    min_share: float = 0.25  # ... and their share of the images in which it should have been seen
 
 
 class SegmentMap(eqx.Module):
@@ -53,6 +56,7 @@ class SegmentMap(eqx.Module):
     updates: Int[Array, "K"]  # delta of eq. (14)
     resting: Int[Array, "K"]  # steps left
     unseen: Int[Array, "K"]  # steps since the last sighting
+    expected: Int[Array, "K"]  # images in which its middle was in view
 
     @property
     def valid(self) -> Bool[Array, "K"]:
@@ -69,6 +73,7 @@ def empty_map(rules: MapRules) -> SegmentMap:
         updates=jnp.zeros(K, int),
         resting=jnp.zeros(K, int),
         unseen=jnp.zeros(K, int),
+        expected=jnp.zeros(K, int),
     )
 
 
@@ -163,6 +168,19 @@ def propose(
     return candidates, slot, -best[:, 0]
 
 
+def in_view(
+    rules: MapRules, camera: Camera, mount: Mount, segment_map: SegmentMap, T_world_robot: SE2
+) -> Bool[Array, "K"]:
+    """Which map lines have their middle in the image and within R; walls are not known to hide them."""
+    H_F = floor_homography(camera, mount, T_world_robot)
+    foot = T_world_robot.apply(mount.T_robot_foot.xy)
+    middle = segment_map.segments_world.endpoints.mean(axis=1) - foot
+    apparent = foot + middle * segment_map.line[:, 2:]
+    x, ahead = jax.vmap(floor_to_image, in_axes=(None, 0))(H_F, apparent)
+    inside = (x >= 0).all(axis=1) & (x < jnp.array([camera.width, camera.height])).all(axis=1)
+    return segment_map.valid & ahead & inside & (jnp.sum(middle**2, axis=1) < rules.range**2)
+
+
 def integrate(
     rules: MapRules,
     sensor: SensorModel,
@@ -172,6 +190,7 @@ def integrate(
     known: Bool[Array, "M"],
     new: Bool[Array, "M"],
     tilt: Float[Array, "2"],
+    in_view: Bool[Array, "K"],
     T_world_foot: SE2,
 ) -> tuple[SegmentMap, Int[Array, ""]]:
     """Step 6 of Fig. 6: every observed segment updates the known line in `slot` or begins a new one.
@@ -180,17 +199,20 @@ def integrate(
     - `slot`, `known`: which map line each sighting is, if any.
     - `new`: sightings that begin a line.
     - `tilt`: wobble (pitch, roll) to correct the sightings for.
+    - `in_view`: which map lines this image should show, of `in_view`.
     - `T_world_foot`: the chosen pose.
 
     **Returns:** the map, and how many new lines found no free slot.
     """
-    segment_map = _update(rules, sensor, segment_map, sightings, slot, known, tilt, T_world_foot)
+    segment_map = _update(
+        rules, sensor, segment_map, sightings, slot, known, tilt, in_view, T_world_foot
+    )
     segment_map, overflow = _insert(rules, segment_map, sightings, new, tilt, T_world_foot)
     segment_map = _merge(rules, segment_map, slot, known)
     return _forget(rules, segment_map), overflow
 
 
-def _update(rules, sensor, m, sightings, slot, known, tilt, T_world_foot):
+def _update(rules, sensor, m, sightings, slot, known, tilt, in_view, T_world_foot):
     K = rules.capacity
     known = known & (m.resting[slot] == 0)
     slot = jnp.where(known, slot, K)  # K: dropped by every scatter
@@ -241,6 +263,7 @@ def _update(rules, sensor, m, sightings, slot, known, tilt, T_world_foot):
         updates=m.updates + touched,
         resting=jnp.where(touched & grown & ~was_grown, rules.rest, jnp.maximum(m.resting - passed, 0)),
         unseen=jnp.where(touched, 0, m.unseen + passed),
+        expected=m.expected + (m.valid & passed & (in_view | touched)),
     )
 
 
@@ -297,6 +320,7 @@ def _insert(rules, m, sightings, new, tilt, T_world_foot):
         updates=put(m.updates, 1),
         resting=put(m.resting, 0),
         unseen=put(m.unseen, 0),
+        expected=put(m.expected, 1),
     ), overflow
 
 

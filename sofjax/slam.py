@@ -14,7 +14,7 @@ from sofjax.likelihood import SensorModel, compare, sight
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion
 from sofjax.observation import Observation
 from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
-from sofjax.segment_map import MapRules, SegmentMap, empty_map, integrate, is_raised, propose
+from sofjax.segment_map import MapRules, SegmentMap, empty_map, in_view, integrate, is_raised, propose
 from sofjax.sof import extract
 
 LOST_AFTER = 10  # images without one known segment
@@ -152,7 +152,8 @@ def step(
     segment_map, overflow = integrate(
         rules, sensor, state.segment_map, sightings,
         jnp.take_along_axis(slot, best.choice[:, None], 1)[:, 0],
-        known, new, best.tilt, T_world_foot_chosen,
+        known, new, best.tilt,
+        in_view(rules, camera, mount, state.segment_map, chosen), T_world_foot_chosen,
     )  # fmt: skip
 
     # 7) the next round starts from here
@@ -229,9 +230,10 @@ def final_map(config: SlamConfig, mount: Mount, segment_map: SegmentMap) -> Fina
     often = segment_map.updates >= rules.min_updates
     kappa, sigma = segment_map.line[:, 2], safe_sqrt(segment_map.covariance[:, 2, 2])
     known = ~jnp.asarray(rules.classify) | (sigma < rules.kappa_known)
+    shown = segment_map.updates >= rules.min_share * segment_map.expected
     return FinalMap(
         endpoints_world=segment_map.segments_world.endpoints,
-        is_floor=segment_map.valid & often & known & ~raised,
+        is_floor=segment_map.valid & often & shown & known & ~raised,
         updates=segment_map.updates,
         height=mount.height * (1 - 1 / kappa),
         height_sigma=mount.height * sigma / kappa**2,
