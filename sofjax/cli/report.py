@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -57,9 +58,9 @@ def write_results(
     results = Results(np.zeros((0, 2, 2)), 0, interrupted, warnings(drive, tally))
     seen, height = np.zeros(0, int), np.zeros(0)
     if state is not None:
-        final = jax.device_get(
-            slam.final_map(settings.slam, drive.camera_file.mount, state.segment_map)
-        )
+        final_map = eqx.filter_jit(slam.final_map)  # one compilation for all its small operations
+        mount = drive.camera_file.mount
+        final = jax.device_get(final_map(settings.slam, mount, state.segment_map))
         keep = final.is_floor
         results.segments, seen, height = (
             v[keep] for v in (final.endpoints_world.astype(float), final.updates, final.height)

@@ -67,13 +67,15 @@ def run(args: argparse.Namespace) -> int:
 
     tally, state, interrupted = Tally(), None, False
     started = time.perf_counter()
-    bar = tqdm(total=len(drive.image_files), desc=drive.name, unit=" frames", disable=None)
+    bar = tqdm(total=len(drive.image_files), desc=drive.name, unit="frame", disable=None)
     with bar, TrajectoryWriter(folder / outputs.TRAJECTORY) as writer:
         try:
             for view, info, seconds, state in steps(settings, drive, frontend):  # noqa: B007
                 tally.add(drive, view, info, seconds, time.perf_counter())
                 writer.write(tally.stamps[-1], tally.poses[-1][:2], tally.poses[-1][2])
                 bar.update()
+                if len(tally.stamps) == 1:
+                    bar.unpause()  # compiling is no part of the frames a second
         except KeyboardInterrupt:
             interrupted = True
     driven = time.perf_counter()
