@@ -42,10 +42,11 @@ def prior_bias(model: MotionModel) -> OdometerBias:
 
 
 def _prior_sigma(model: MotionModel) -> Float[Array, "4"]:
-    turn = jnp.asarray(model.turn_scale_sigma)
-    return jnp.stack(
-        [jnp.asarray(model.distance_scale_sigma), turn, turn, jnp.asarray(model.curvature_sigma)]
+    distance, turn, curvature = (
+        jnp.asarray(sigma, float)
+        for sigma in (model.distance_scale_sigma, model.turn_scale_sigma, model.curvature_sigma)
     )
+    return jnp.stack([distance, turn, turn, curvature])
 
 
 def sample_motion(

@@ -21,7 +21,7 @@ class Particles(eqx.Module):
         N = self.log_weight.shape[0]
         T = SE2(self.T_world_robot.xy[index], self.T_world_robot.yaw[index])
         bias = OdometerBias(self.bias.mean[index], self.bias.covariance)
-        return Particles(T, bias, jnp.full(N, -jnp.log(N)))
+        return Particles(T, bias, jnp.full(N, -jnp.log(N), float))
 
 
 def effective_size(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
