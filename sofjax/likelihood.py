@@ -8,7 +8,7 @@ its direction, and its distance rho is the true one times the magnification kapp
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, segment_to_floor
@@ -26,6 +26,7 @@ class SensorModel(eqx.Module):
     rho_sigma: float = 0.02  # metres; the constant sigmas, and with `propagate` ...
     theta_sigma: float = 0.02  # radians; ... unused
     theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
+    adaptation: float = 0.3  # share of the surplus misfit by which the noise grows in a step
     e_max: float = 9.0  # cost of an observed segment that matches nothing
 
 
@@ -49,7 +50,8 @@ def sight(
     camera: Camera,
     mount: Mount,
     segments_image: Segments,
-    max_depth: float,
+    max_depth: Float[Array, ""] | float,
+    noise: Float[Array, ""] | float = 1.0,
 ) -> Sightings:
     """Put an image's segments on the floor together with their own covariances.
 
@@ -60,6 +62,7 @@ def sight(
     **Arguments:**
     - `segments_image`: M segments, pixels of the undistorted image.
     - `max_depth`: metres; what is farther is clipped away.
+    - `noise`: multiple of the variance of the pixels.
     """
     foot = mount.T_robot_foot.xy
 
@@ -77,7 +80,7 @@ def sight(
             on_floor, argnums=(0, 1), has_aux=True
         )(endpoints_image, jnp.zeros(2))
         by_pixel = by_pixel.reshape(2, 4)
-        propagated = sensor.pixel_sigma**2 * by_pixel @ by_pixel.T
+        propagated = noise * sensor.pixel_sigma**2 * by_pixel @ by_pixel.T
         return endpoints, line, some, propagated, by_tilt
 
     endpoints, line, some, covariance, tilt = jax.vmap(one)(segments_image.endpoints)
@@ -88,6 +91,18 @@ def sight(
     some = some & (covariance[:, 1, 1] < sensor.theta_limit**2)
     # what is reported at the nominal tilt moves against the correction
     return Sightings(endpoints, some & segments_image.valid, line, covariance, -tilt)
+
+
+def adapt_noise(
+    sensor: SensorModel, noise: Float[Array, ""], misfit: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Believe the pixels less where matched segments disagree more than their sigmas allow.
+
+    A mount that is only roughly known, a rolling shutter or blur make all of them inconsistent,
+    and a filter that is too sure of its sensor then leaves the odometer. Matched errors e have
+    the mean 2; the noise never falls below the sensor model's.
+    """
+    return jnp.maximum(noise * jnp.exp(sensor.adaptation * (misfit / 2 - 1)), 1)
 
 
 class Candidates(eqx.Module):
@@ -116,7 +131,7 @@ class Comparison(eqx.Module):
     """One pose against the map."""
 
     log_likelihood: Float[Array, "*batch"]
-    choice: Float[Array, "*batch M"]  # index among the candidates
+    choice: Int[Array, "*batch M"]  # index among the candidates
     error: Float[Array, "*batch M"]  # e of the chosen candidate, its share of the tilt removed
     tilt: Float[Array, "*batch 2"]  # most likely wobble (pitch, roll) of the moment, radians
 

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
@@ -84,3 +84,16 @@ def sample_motion(
     gain = covariance @ A.T / jnp.where(sigma > 0, sigma, 1) ** 2
     learned = OdometerBias(bias.mean + gain @ innovation, covariance - gain @ A @ covariance)
     return SE2.exp(jnp.stack([moved, sideways + slip, turned])), learned
+
+
+def sample_motions(
+    model: MotionModel, bias: OdometerBias, odometer: SE2, keys: Key[Array, "N"]
+) -> tuple[SE2, OdometerBias]:
+    """`sample_motion` for all particles: means [N, 4] and keys [N], one covariance for all."""
+
+    def one(mean, key):
+        motion, learned = sample_motion(model, OdometerBias(mean, bias.covariance), odometer, key)
+        return motion, learned.mean, learned.covariance
+
+    motion, mean, covariance = jax.vmap(one, out_axes=(0, 0, None))(bias.mean, keys)
+    return motion, OdometerBias(mean, covariance)

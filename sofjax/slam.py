@@ -10,8 +10,8 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-from sofjax.likelihood import SensorModel, compare, sight
-from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion
+from sofjax.likelihood import SensorModel, adapt_noise, compare, sight
+from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions
 from sofjax.observation import Observation
 from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
 from sofjax.segment_map import MapRules, SegmentMap, empty_map, in_view, integrate, is_raised, propose
@@ -54,6 +54,7 @@ class SlamState(eqx.Module):
     segment_map: SegmentMap
     recent: View  # the last two views kept, a baseline apart
     reference: View
+    noise: Float[Array, ""]  # variance of the sightings as multiple of the sensor model's, >= 1
     unmatched: Int[Array, ""]  # images in a row without one known segment
     key: PRNGKeyArray
 
@@ -90,13 +91,15 @@ def init(
     particles = Particles(
         SE2(jnp.zeros((N, 2)), jnp.zeros(N)),
         OdometerBias(jnp.broadcast_to(bias.mean, (N, 4)), bias.covariance),
-        jnp.full(N, -jnp.log(N)),
+        jnp.full(N, -jnp.log(N), float),
     )
     none = View(Segments(jnp.zeros((capacity, 2, 2)), jnp.zeros(capacity, bool)), SE2.identity())
-    return SlamState(particles, empty_map(config.segment_map), none, none, jnp.zeros((), int), key)
+    return SlamState(
+        particles, empty_map(config.segment_map), none, none, jnp.ones(()), jnp.zeros((), int), key
+    )
 
 
-@eqx.filter_jit
+@jax.jit
 def step(
     config: SlamConfig, camera: Camera, mount: Mount, state: SlamState, observation: Observation
 ) -> tuple[SlamState, StepInfo]:
@@ -107,15 +110,17 @@ def step(
     before = mean_pose(state.particles)
 
     # 1-3) move, and sample N particles by the motion model
-    motion, bias = jax.vmap(
-        sample_motion, in_axes=(None, OdometerBias(0, None), None, 0), out_axes=(0, OdometerBias(0, None))
-    )(config.motion, state.particles.bias, observation.motion, jax.random.split(key_motion, N))
+    motion, bias = sample_motions(
+        config.motion, state.particles.bias, observation.motion, jax.random.split(key_motion, N)
+    )
     T_world_robot = state.particles.T_world_robot @ motion
     moved = Particles(T_world_robot, bias, state.particles.log_weight)
     predicted = mean_pose(moved)
 
     # 4) put the segments on the floor, and extract SoF (Fig. 5) against a view a baseline away
-    sightings = sight(sensor, camera, mount, observation.segments_image, config.filter.max_depth)
+    sightings = sight(
+        sensor, camera, mount, observation.segments_image, config.filter.max_depth, state.noise
+    )
     view = _view_a_baseline_away(config.association, state, predicted)
     sof = lambda T: extract(
         config.association, camera, mount, view.segments_image, observation.segments_image,
@@ -158,6 +163,8 @@ def step(
 
     # 7) the next round starts from here
     recent, reference = _keep_views(config.association, state, observation, chosen)
+    misfit = jnp.where(known, best.error, 0).sum() / jnp.maximum(known.sum(), 1)
+    noise = jnp.where(known.any(), adapt_noise(sensor, state.noise, misfit), state.noise)
     unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
     detected = observation.segments_image.valid
     info = StepInfo(
@@ -166,7 +173,7 @@ def step(
         effective_size=size,
         log_evidence=log_evidence,
         tilt=best.tilt,
-        misfit=jnp.where(known, best.error, 0).sum() / jnp.maximum(known.sum(), 1),
+        misfit=misfit,
         detected=detected.sum(),
         below_horizon=sightings.valid.sum(),
         associated=is_sof.sum(),
@@ -176,10 +183,10 @@ def step(
         lost=unmatched >= LOST_AFTER,
         segment_class=detected.astype(int) + sightings.valid + (sightings.valid & (known | new)),
     )
-    return SlamState(particles, segment_map, recent, reference, unmatched, key), info
+    return SlamState(particles, segment_map, recent, reference, noise, unmatched, key), info
 
 
-@eqx.filter_jit
+@jax.jit
 def run(
     config: SlamConfig, camera: Camera, mount: Mount, state: SlamState, observations: Observation
 ) -> tuple[SlamState, StepInfo]:

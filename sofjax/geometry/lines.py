@@ -55,7 +55,7 @@ def polar_through(endpoints: Float[Array, "2 2"]) -> PolarLine:
     return PolarLine(rho=safe_divide(normal @ middle, safe_norm(d)), theta=safe_arctan2(d[1], d[0]))
 
 
-def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "2"]:
+def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "*batch 2"]:
     """(rho_a - rho_b, theta_a - theta_b) of two lines, whichever way each is directed.
 
     Differs from the paper: eq. (9) subtracts the numbers as they stand, which jump by the

@@ -20,13 +20,13 @@ class SE2(eqx.Module):
     def identity() -> "SE2":
         return SE2(jnp.zeros(2), jnp.zeros(()))
 
-    def rotate(self, vectors: Float[Array, "*points 2"]) -> Float[Array, "*points 2"]:
+    def rotate(self, vectors: Float[Array, "*points 2"]) -> Float[Array, "... 2"]:
         """Turn vectors, whose axes in front broadcast against the batch's."""
         c, s = jnp.cos(self.yaw), jnp.sin(self.yaw)
         x, y = vectors[..., 0], vectors[..., 1]
         return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
 
-    def apply(self, points: Float[Array, "*points 2"]) -> Float[Array, "*points 2"]:
+    def apply(self, points: Float[Array, "*points 2"]) -> Float[Array, "... 2"]:
         """Points of frame b in frame a, metres."""
         return self.rotate(points) + self.xy
 
