@@ -38,7 +38,7 @@ def furnish(
         floor=np.clip(rng.uniform(0.38, 0.72) * tint, 0, 1),
         wall=np.clip(rng.uniform(0.5, 0.8) * rng.uniform(0.93, 1.07, 3), 0, 1),
         ceiling=np.full(3, rng.uniform(0.1, 0.6)),
-        grain=rng.uniform(0.02, 0.08),
+        grain=rng.uniform(0.02, 0.05),
         gloss=rng.uniform(0.0, 0.6),
     )
     on_floor = Paint()

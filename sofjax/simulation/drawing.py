@@ -5,6 +5,7 @@ and all, six to a pixel, and end at the nearest of floor, ceiling, walls and box
 what, and where an edge lies, is exact.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,16 +40,23 @@ class Imaging:
     adaptation: float = 1.0  # seconds that it takes to follow
     vignetting: float = 0.15  # share of light lost in the corners
 
+    def check(self) -> None:
+        """Refuse a camera that cannot be, in a sentence."""
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf:
+                raise InputError(f"the camera's {name.replace('_', ' ')} is {value:g}; 0 is the least")
+
 
 class Artist:
     """Draws one world as one camera sees it."""
 
     def __init__(self, world: World, camera_file: CameraFile, imaging: Imaging, seed: int = 0):
+        imaging.check()
         self._world = world
         self._imaging = imaging
         self._camera = camera_file.camera
-        self._atlas = paint_atlas(world, seed)
         self._rays = jnp.asarray(lens_rays(camera_file), jnp.float32)
+        self._atlas = paint_atlas(world, seed)
         self._mirror = _mirrored_lamps(world)
         self._vignette = _vignette(self._camera.width, self._camera.height, imaging.vignetting)
         self._rng = np.random.default_rng([seed, 23])
@@ -133,28 +141,49 @@ def write_image(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
 def lens_rays(camera_file: CameraFile) -> Float[np.ndarray, "3 rays"]:
     """Directions in the camera frame, depth 1, of `RAYS` of every pixel of the image as taken.
 
+    The lens's polynomial is inverted by Newton's method at the middle of every pixel, and taken
+    as linear within it.
+
     **Raises:** `InputError` if the lens bends the image over itself inside the picture.
     """
     camera = camera_file.camera
-    K, distortion = np.asarray(camera.K, float), camera_file.distortion
-    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    pixels = (RAYS[:, None] + np.stack([x.ravel(), y.ravel()], axis=-1)).reshape(-1, 1, 2)
-    if camera_file.distortion_model == "equidistant":
-        undistorted = cv2.fisheye.undistortPoints(pixels, K, distortion)
-        again = cv2.fisheye.distortPoints(undistorted, K, distortion)
-    else:
-        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-4)
-        undistorted = cv2.undistortPoints(pixels, K, distortion, criteria=stop)
-        solid = np.concatenate([undistorted, np.ones((len(undistorted), 1, 1))], axis=-1)
-        again = cv2.projectPoints(solid, np.zeros(3), np.zeros(3), K, distortion)[0]
-    wrong = np.linalg.norm((again - pixels).reshape(-1, 2), axis=1).max()
-    if not wrong < 0.05:
+    K = np.asarray(camera.K, float)
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    wanted = np.stack([columns.ravel(), rows.ravel()], axis=-1).astype(float)
+    x = (wanted - K[:2, 2]) / np.diag(K)[:2]
+    for _ in range(20):
+        pixels, slope = _distorted(camera_file, x)
+        move = np.linalg.solve(slope, (wanted - pixels)[..., None])[..., 0]
+        x = x + np.clip(move, -0.3, 0.3)
+        if np.abs(move).max() < 1e-7:
+            break
+    pixels, slope = _distorted(camera_file, x)
+    if not (np.abs(pixels - wanted).max() < 0.02 and np.linalg.det(slope).min() > 0):
         raise InputError(
-            f"the distortion {', '.join(f'{v:g}' for v in distortion)} folds the image over itself; "
-            "its coefficients must keep straight lines apart up to the corners"
+            f"the distortion {', '.join(f'{v:g}' for v in camera_file.distortion)} folds the image "
+            "over itself; its coefficients must keep straight lines apart up to the corners"
         )
-    directions = undistorted.reshape(-1, 2)
+    directions = x + np.einsum("pij,rj->rpi", np.linalg.inv(slope), RAYS)
+    directions = directions.reshape(-1, 2)
     return np.concatenate([directions, np.ones((len(directions), 1))], axis=1).T
+
+
+def _distorted(camera_file: CameraFile, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of directions (x, y, 1) through the lens [n, 2], and their slope [n, 2, 2]."""
+    K = np.asarray(camera_file.camera.K, float)
+
+    def through(points: np.ndarray) -> np.ndarray:
+        if camera_file.distortion_model == "equidistant":
+            bent = cv2.fisheye.distortPoints(points[:, None], K, camera_file.distortion)
+        else:
+            solid = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+            bent = cv2.projectPoints(solid, np.zeros(3), np.zeros(3), K, camera_file.distortion)[0]
+        return bent.reshape(-1, 2)
+
+    h = 1e-4
+    steps = np.eye(2) * h
+    slope = [(through(x + step) - through(x - step)) / (2 * h) for step in steps]
+    return through(x), np.stack(slope, axis=-1)
 
 
 def _in_view(

@@ -105,7 +105,7 @@ def grid(
     angle: float,
     spacing: float,
 ) -> None:
-    colour = contrasting(rng, floor, 0.15, 0.30, darker=bool(rng.random() < 0.8))
+    colour = contrasting(rng, floor, 0.18, 0.32, darker=bool(rng.random() < 0.8))
     width = rng.uniform(0.007, 0.012)
     centre = (plan.corridors[:, :2].min(0) + plan.corridors[:, 2:].max(0)) / 2
     reach = np.linalg.norm(plan.corridors[:, 2:].max(0) - plan.corridors[:, :2].min(0)) / 2 + spacing
@@ -218,7 +218,7 @@ def fit_walls(
         doors = _places(rng, length, 0.9, rng.uniform(1.5, 5.0))
         edges = [0.0, *(s for place in doors for s in place), length]
         for a, b in zip(edges[::2], edges[1::2], strict=True):
-            on_walls.area("baseboard", rectangle(a, 0, b, baseboard_height), baseboard, w)
+            on_walls.area("baseboard", rectangle(a, 0.0, b, baseboard_height), baseboard, w)
             if with_rail and b - a > 0.3:
                 on_walls.area("rail", rectangle(a, rail_low, b, rail_low + 0.12), rail, w)
             elif b - a > 1.2 and rng.random() < 0.5:
@@ -227,8 +227,8 @@ def fit_walls(
                 colour = contrasting(rng, wall * rng.uniform(0.6, 1.0, 3), 0.1, 0.4)
                 on_walls.area("board", rectangle(s, low, s + size[0], low + size[1]), colour, w)
         for a, b in doors:
-            on_walls.area("frame", rectangle(a, 0, b, 2.1), frame, w)
-            on_walls.area("door", rectangle(a + 0.05, 0, b - 0.05, 2.05), door, w)
+            on_walls.area("frame", rectangle(a, 0.0, b, 2.1), frame, w)
+            on_walls.area("door", rectangle(a + 0.05, 0.0, b - 0.05, 2.05), door, w)
             if rng.random() < 0.7:
                 d = directions[w]
                 foot = start + np.outer([a, b], d)
@@ -284,5 +284,5 @@ def put_boxes(
         gaps = [np.maximum(box[:2] - other[2:4], other[:2] - box[2:]).max() for other in boxes]
         if distance_to_way(plan.way, rectangle(*box)).min() > clearance and min(gaps, default=1) > 0:
             boxes.append(np.append(box, rng.choice([0.3, 0.45, 0.8, 1.5])))
-            colours.append(rng.uniform(0.1, 0.7, 3))
+            colours.append(0.6 * rng.uniform(0.1, 0.8) + 0.4 * rng.uniform(0.1, 0.8, 3))
     return np.array(boxes, float).reshape(-1, 5), np.array(colours, float).reshape(-1, 3)

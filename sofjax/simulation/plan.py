@@ -82,13 +82,12 @@ def offset_walls(
     corridors: Float[np.ndarray, "n 4"], walls: Float[np.ndarray, "walls 2 2"], distance: float
 ) -> Float[np.ndarray, "walls 2 2"]:
     """The walls moved `distance` into the corridor, cut and lengthened so that they meet again."""
-    moved = []
-    for wall, d in zip(walls, wall_directions(walls), strict=True):
-        n = np.array([-d[1], d[0]])
-        back, on = (inside(corridors, p + 1e-3 * (s * d + n)) for p, s in zip(wall, (-1, 1), strict=True))
-        lengthen = np.array([-1 if back else 1, 1 if on else -1])[:, None] * distance * d
-        moved.append(wall + distance * n + lengthen)
-    return np.array(moved)
+    d = wall_directions(walls)
+    n = left_normal(d)
+    outward = np.stack([-d, d], axis=1)  # at either end, on along the wall
+    goes_on = inside(corridors, walls + 1e-3 * (outward + n[:, None]))
+    lengthen = np.where(goes_on, distance, -distance)[..., None] * outward
+    return walls + distance * n[:, None] + lengthen
 
 
 def distance_to_way(

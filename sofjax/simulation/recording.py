@@ -36,6 +36,9 @@ def record(
     shutil.rmtree(beside, ignore_errors=True)
     try:
         (beside / "rgb").mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{path}: the drive cannot be written there ({error.strerror})") from None
+    try:
         _write_tables(beside, world, rig, ride)
         frames = zip(ride.truth.stamps, *ride.camera_poses(), ride.turn_rate, strict=True)
         for i, (stamp, R_world_camera, C, turn_rate) in enumerate(progress(list(frames))):

@@ -1,6 +1,7 @@
 """A ride: a robot driven through a world, what was true of it and what its odometer read."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import jax
@@ -10,30 +11,36 @@ from jaxtyping import Array
 
 from sofjax.geometry import SE2, Camera, Mount
 from sofjax.geometry.camera import rotation_robot_camera, rotation_z
-from sofjax.io.camera_file import CameraFile
+from sofjax.io.camera_file import CameraFile, horizon_image
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory
 from sofjax.simulation.catalogue import check_way
+from sofjax.simulation.plan import inside
 from sofjax.simulation.robots import Driver, Odometer, drive_along, increments, read_path
 from sofjax.simulation.worlds import World
 
 
-def paper_camera(
-    height: float = 1.0, pitch: float = math.radians(12), focal: float = 291.0, **mount: float
+PAPER_MOUNT = Mount.create(height=1.0, pitch=math.radians(12), x=0.1)
+
+
+def webcam(
+    mount: Mount = PAPER_MOUNT,
+    focal: float = 291.0,
+    width: int = 320,
+    height: int = 240,
+    distortion: Sequence[float] | np.ndarray = (-0.09, 0.03, 0.0006, -0.0004, 0.0),
 ) -> CameraFile:
-    """The paper's webcam, 320×240 on top of the robot; metres, radians, pixels. Section IV.A."""
-    K = jnp.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
-    distortion = np.array([-0.09, 0.03, 0.0006, -0.0004, 0.0])
-    camera = Camera(K, 320, 240)
-    placed = Mount.create(height, pitch, **{"x": 0.1, **mount})
-    return CameraFile(camera, placed, distortion, "plumb_bob", "simulated")
+    """A camera like the paper's on top of the robot, looking at the middle; pixels. Section IV.A."""
+    K = jnp.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], float)
+    camera = Camera(K, width, height)
+    return CameraFile(camera, mount, np.array(distortion, float), "plumb_bob", "simulated")
 
 
 @dataclass(frozen=True)
 class Rig:
     """A robot with its camera, its odometer and its driver."""
 
-    camera_file: CameraFile = field(default_factory=paper_camera)
+    camera_file: CameraFile = field(default_factory=webcam)
     driver: Driver = Driver()
     odometer: Odometer = field(default_factory=Odometer)
     image_rate: float = 10.0  # images a second
@@ -45,15 +52,15 @@ class Rig:
 def random_rig(seed: int) -> Rig:
     """A robot unlike others: its camera, the camera's place, and the errors of its odometer."""
     rng = np.random.default_rng([seed, 37])
-    camera_file = paper_camera(
+    mount = Mount.create(
         height=float(rng.uniform(0.4, 1.2)),
         pitch=math.radians(rng.uniform(10, 25)),
-        focal=float(rng.uniform(240, 330)),
         x=float(rng.uniform(-0.1, 0.3)),
         y=float(rng.uniform(-0.08, 0.08)),
         roll=math.radians(rng.normal(0, 0.7)),
         yaw=math.radians(rng.normal(0, 1.5)),
     )
+    camera_file = webcam(mount, focal=float(rng.uniform(240, 330)))
     odometer = Odometer(
         distance=rng.normal(1, 0.012),
         left=rng.normal(1.02, 0.035),
@@ -110,33 +117,57 @@ def take_ride(world: World, rig: Rig, seed: int = 0, most_images: int | None = N
     before, after = path.at(stamps - 0.02), path.at(stamps + 0.02)
     speed = np.linalg.norm(after.xy - before.xy, axis=-1) / 0.04
     shake = rig.vibration * (speed / rig.driver.speed)[:, None] * rng.standard_normal((len(stamps), 2))
-    return Ride(truth, (after.yaw - before.yaw) / 0.04, odometry, _shaken(rig.camera_file.mount, shake))
+    turn_rate = (after.yaw - before.yaw) / 0.04
+    ride = Ride(truth, turn_rate, odometry, _shaken(rig.camera_file.mount, shake))
+    C = ride.camera_poses()[1]
+    for outside in C[~inside(world.corridors, C[:, :2])][:1]:
+        raise InputError(
+            f"the camera goes through a wall at ({outside[0]:.2f}, {outside[1]:.2f}); its place on "
+            "the robot must be nearer to the middle"
+        )
+    return ride
 
 
 def _shaken(mount: Mount, shake: np.ndarray) -> Mount:
     """The mount at each image, its pitch and roll moved by `shake` [T, 2] radians."""
-    still = jax.tree.map(lambda value: jnp.broadcast_to(value, (len(shake),)), mount)
-    pitch, roll = jnp.asarray(shake, still.pitch.dtype).T
-    return Mount(still.x, still.y, still.height, still.pitch + pitch, still.roll + roll, still.yaw)
+
+    @jax.jit
+    @jax.vmap
+    def one(moved: Array) -> Mount:
+        pitch, roll = mount.pitch + moved[0], mount.roll + moved[1]
+        return Mount(mount.x, mount.y, mount.height, pitch, roll, mount.yaw)
+
+    return one(jnp.asarray(shake, mount.pitch.dtype))
 
 
 def check_rig(world: World, rig: Rig) -> None:
     """Refuse a robot that cannot be, in a sentence."""
-    height = float(rig.camera_file.mount.height)
+    camera, mount = rig.camera_file.camera, rig.camera_file.mount
+    height = float(mount.height)
     if not 0 < height < world.ceiling:
         where = "in or under the floor" if height <= 0 else "above the ceiling"
         raise InputError(
             f"a camera {height:g} m high is {where}; it must be between 0 and {world.ceiling:.2f} m"
         )
+    right, bottom = camera.width - 1, camera.height - 1
+    corners = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1]])
+    if (corners @ horizon_image(np.asarray(camera.K), float(mount.pitch), float(mount.roll)) <= 0).all():
+        raise InputError(
+            f"with a pitch of {math.degrees(mount.pitch):g} degrees the camera sees no floor; "
+            "pitch > 0 looks down"
+        )
     odometer = rig.odometer
     for name, value in (
-        ("vibration", rig.vibration),
+        ("vibration in degrees", math.degrees(rig.vibration)),
         ("share of dropped readings", rig.dropped),
         ("noise of the odometer's distance", odometer.distance_noise),
         ("noise of the odometer's heading", odometer.heading_noise),
         ("noise of the odometer's turns", odometer.turn_noise),
-        ("slips per metre", odometer.slip),
+        ("number of slips per metre", odometer.slip),
         ("wobble", rig.driver.wobble),
+        ("scale of the odometer's distance", odometer.distance),
+        ("scale of the odometer's left turns", odometer.left),
+        ("scale of the odometer's right turns", odometer.right),
     ):
         if not 0 <= float(value) < math.inf:
             raise InputError(f"the {name} is {float(value):g}; it must be 0 or more")

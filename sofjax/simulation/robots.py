@@ -1,6 +1,7 @@
 """A robot that a hand drives along a way, and the odometer that reads its motion wrongly."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -85,6 +86,10 @@ def _advance(way: np.ndarray, arc: np.ndarray, at: np.ndarray, progress: float) 
     return float(ahead[np.linalg.norm(points - at, axis=1).argmin()])
 
 
+def _number(default: float) -> Any:
+    return eqx.field(converter=lambda value: jnp.asarray(value, float), default=default)
+
+
 class Odometer(eqx.Module):
     """What wheels report: scales that are wrong, a bent straight, noise and slip.
 
@@ -92,15 +97,16 @@ class Odometer(eqx.Module):
     read as more than they were, so that the path spins inward.
     """
 
-    distance: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=1.01)  # read / true
-    left: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=1.02)  # read / true
-    right: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=1.07)  # read / true
-    bend: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=0.0)  # radians per metre
-    distance_noise: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=0.004)  # m/√m
-    heading_noise: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=0.003)  # rad/√m
-    turn_noise: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=0.01)  # rad/√rad
-    slip: Float[Array, "*batch"] = eqx.field(converter=jnp.asarray, default=0.02)  # slips per metre
+    distance: Float[Array, "*batch"] = _number(1.01)  # read / true
+    left: Float[Array, "*batch"] = _number(1.02)  # read / true
+    right: Float[Array, "*batch"] = _number(1.07)  # read / true
+    bend: Float[Array, "*batch"] = _number(0.0)  # radians per metre driven
+    distance_noise: Float[Array, "*batch"] = _number(0.004)  # metres per sqrt(metre)
+    heading_noise: Float[Array, "*batch"] = _number(0.003)  # radians per sqrt(metre)
+    turn_noise: Float[Array, "*batch"] = _number(0.01)  # radians per sqrt(radian)
+    slip: Float[Array, "*batch"] = _number(0.02)  # slips per metre
 
+    @jax.jit
     def read(self, motions: SE2, key: PRNGKeyArray) -> SE2:
         """The readings of a run of motions; their noise adds up alike however they are cut.
 
@@ -133,9 +139,13 @@ TRACK = 0.4  # metres between the wheels
 
 def increments(trajectory: Trajectory) -> SE2:
     """T_previous_current between the poses of a path; the identity at the first."""
-    first = np.arange(-1, len(trajectory.stamps) - 1).clip(0)
-    poses = SE2(jnp.asarray(trajectory.xy), jnp.asarray(trajectory.yaw))
-    return jax.tree.map(lambda leaf: leaf[first], poses).between(poses)
+    return _between_poses(SE2(jnp.asarray(trajectory.xy), jnp.asarray(trajectory.yaw)))
+
+
+@jax.jit
+def _between_poses(poses: SE2) -> SE2:
+    before = jax.tree.map(lambda leaf: jnp.concatenate([leaf[:1], leaf[:-1]]), poses)
+    return before.between(poses)
 
 
 def read_path(odometer: Odometer, truth: Trajectory, key: PRNGKeyArray) -> Trajectory:
