@@ -155,7 +155,7 @@ def test_a_perfect_odometer_reads_the_true_path():
     truth = ride_of("l").truth
     read = read_path(PERFECT, truth, jax.random.key(0))
     first = SE2(jnp.asarray(truth.xy[0]), jnp.asarray(truth.yaw[0]))
-    back = first.apply(jnp.asarray(read.xy, first.xy.dtype))
+    back = jax.vmap(first.apply)(jnp.asarray(read.xy, first.xy.dtype))
     np.testing.assert_allclose(back, truth.xy, atol=2e-4)
 
 
@@ -522,7 +522,7 @@ def test_the_longest_segments_fit_and_the_rest_is_counted():
 def forty_drives():
     """Stretches of one ride, each as if it were a drive."""
     ride = ride_of("paper")
-    starts = jnp.arange(100, 1100, 25)[:, None] + jnp.arange(FRAMES)
+    starts = jnp.arange(100, 1100, 25)[:, None] + jnp.arange(FRAMES)[None]
     poses, mounts = (jax.tree.map(lambda leaf: leaf[starts], tree) for tree in (ride.poses(), ride.mounts))
     return mounts, poses, poses, jax.random.split(jax.random.key(0), DRIVES)
 
