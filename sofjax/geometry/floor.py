@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sofjax.geometry.angles import safe_divide
 from sofjax.geometry.camera import Camera, Mount, projection_matrix
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import clip
@@ -87,20 +86,3 @@ def line_to_image(
 def horizon(H_F: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """The image line of the floor's points at infinity, scaled so that l·(x, y, 1) = 1 / depth."""
     return jnp.linalg.inv(H_F)[2]
-
-
-def plane_pair(
-    P: Float[Array, "3 4"], line: Float[Array, "3"], P2: Float[Array, "3 4"], line2: Float[Array, "3"]
-) -> Float[Array, "2 4"]:
-    """L as the two planes that views of it span, [lᵀP; l'ᵀP']; eq. (3).
-
-    The general way, for lines anywhere in space. Points of the line are its null space.
-    """
-    return jnp.stack([line @ P, line2 @ P2])
-
-
-def trace_on_floor(planes: Float[Array, "2 4"]) -> Float[Array, "2"]:
-    """The point in which the line of eq. (3) meets the floor Z = 0; zero where it is parallel to it."""
-    (a1, b1, _, d1), (a2, b2, _, d2) = planes
-    w = a1 * b2 - a2 * b1
-    return safe_divide(jnp.stack([b1 * d2 - b2 * d1, a2 * d1 - a1 * d2]), w)

@@ -1,0 +1,54 @@
+"""Strict JAX for every test: no silent promotion of types, and float64 where a test asks for it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sofjax.geometry import Camera, Mount
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture
+def x64():
+    """The laws hold to many digits; in float32 they would hide in the rounding."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20240)
+
+
+def make_camera(focal=270.0):
+    K = jnp.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
+    return Camera(K, width=320, height=240)
+
+
+@pytest.fixture
+def camera():
+    return make_camera()
+
+
+@pytest.fixture
+def mount():
+    """A camera 60 cm over the floor, a little ahead of the axle and looking 15 degrees down."""
+    return Mount.create(height=0.6, pitch=0.2618, x=0.05)
+
+
+@pytest.fixture
+def mounts(rng):
+    """Mounts of every tilt and lever arm."""
+    return [
+        Mount.create(
+            height=rng.uniform(0.1, 1.5),
+            pitch=rng.uniform(-0.1, 0.7),
+            x=rng.uniform(-0.4, 0.4),
+            y=rng.uniform(-0.4, 0.4),
+            roll=rng.uniform(-0.3, 0.3),
+            yaw=rng.uniform(-3, 3),
+        )
+        for _ in range(8)
+    ]
