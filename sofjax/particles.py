@@ -33,7 +33,7 @@ def systematic(key: PRNGKeyArray, log_weight: Float[Array, "N"]) -> Int[Array, "
     """Indices drawn by systematic resampling: one uniform number and N equally spaced teeth."""
     N = log_weight.shape[0]
     cumulative = jnp.cumsum(jnp.exp(log_weight))
-    teeth = (jax.random.uniform(key) + jnp.arange(N)) / N * cumulative[-1]
+    teeth = (jax.random.uniform(key) + jnp.arange(N, dtype=float)) / N * cumulative[-1]
     return jnp.clip(jnp.searchsorted(cumulative, teeth), 0, N - 1)
 
 

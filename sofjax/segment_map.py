@@ -177,7 +177,7 @@ def in_view(
     middle = segment_map.segments_world.endpoints.mean(axis=1) - foot
     apparent = foot + middle * segment_map.line[:, 2:]
     x, ahead = jax.vmap(floor_to_image, in_axes=(None, 0))(H_F, apparent)
-    inside = (x >= 0).all(axis=1) & (x < jnp.array([camera.width, camera.height])).all(axis=1)
+    inside = (x >= 0).all(axis=1) & (x < jnp.array([camera.width, camera.height], float)).all(axis=1)
     return segment_map.valid & ahead & inside & (jnp.sum(middle**2, axis=1) < rules.range**2)
 
 
@@ -254,16 +254,16 @@ def _update(rules, sensor, m, sightings, slot, known, tilt, in_view, T_world_foo
     endpoints = _extend(rules, line, covariance, anchor, m, sightings, slot, T_world_foot)
     grown = safe_norm(endpoints[:, 1] - endpoints[:, 0]) > rules.length
     was_grown = m.segments_world.length > rules.length
-    passed = sightings.valid.any()  # an image without one segment leaves the map as it was
+    passed = sightings.valid.any().astype(int)  # an image without one segment leaves the map as it was
     return SegmentMap(
         segments_world=Segments(jnp.where(touched[:, None, None], endpoints, m.segments_world.endpoints), m.valid),
         anchor=anchor,
         line=line,
         covariance=covariance,
-        updates=m.updates + touched,
+        updates=m.updates + touched.astype(int),
         resting=jnp.where(touched & grown & ~was_grown, rules.rest, jnp.maximum(m.resting - passed, 0)),
         unseen=jnp.where(touched, 0, m.unseen + passed),
-        expected=m.expected + (m.valid & passed & (in_view | touched)),
+        expected=m.expected + passed * (m.valid & (in_view | touched)).astype(int),
     )
 
 

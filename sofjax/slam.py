@@ -163,7 +163,7 @@ def step(
 
     # 7) the next round starts from here
     recent, reference = _keep_views(config.association, state, observation, chosen)
-    misfit = jnp.where(known, best.error, 0).sum() / jnp.maximum(known.sum(), 1)
+    misfit = jnp.where(known, best.error, 0).sum() / jnp.maximum(known.sum(), 1).astype(float)
     noise = jnp.where(known.any(), adapt_noise(sensor, state.noise, misfit), state.noise)
     unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
     detected = observation.segments_image.valid
@@ -181,7 +181,9 @@ def step(
         born=new.sum() - overflow,
         map_overflow=overflow,
         lost=unmatched >= LOST_AFTER,
-        segment_class=detected.astype(int) + sightings.valid + (sightings.valid & (known | new)),
+        segment_class=sum(
+            stage.astype(int) for stage in (detected, sightings.valid, sightings.valid & (known | new))
+        ),
     )
     return SlamState(particles, segment_map, recent, reference, noise, unmatched, key), info
 
@@ -237,7 +239,7 @@ def final_map(config: SlamConfig, mount: Mount, segment_map: SegmentMap) -> Fina
     often = segment_map.updates >= rules.min_updates
     kappa, sigma = segment_map.line[:, 2], safe_sqrt(segment_map.covariance[:, 2, 2])
     known = ~jnp.asarray(rules.classify) | (sigma < rules.kappa_known)
-    shown = segment_map.updates >= rules.min_share * segment_map.expected
+    shown = segment_map.updates >= rules.min_share * segment_map.expected.astype(float)
     return FinalMap(
         endpoints_world=segment_map.segments_world.endpoints,
         is_floor=segment_map.valid & often & shown & known & ~raised,
