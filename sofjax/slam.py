@@ -239,7 +239,8 @@ def final_map(config: SlamConfig, mount: Mount, segment_map: SegmentMap) -> Fina
     often = segment_map.updates >= rules.min_updates
     kappa, sigma = segment_map.line[:, 2], safe_sqrt(segment_map.covariance[:, 2, 2])
     known = ~jnp.asarray(rules.classify) | (sigma < rules.kappa_known)
-    shown = segment_map.updates >= rules.min_share * segment_map.expected.astype(float)
+    updates, expected = segment_map.updates.astype(float), segment_map.expected.astype(float)
+    shown = updates >= rules.min_share * expected
     return FinalMap(
         endpoints_world=segment_map.segments_world.endpoints,
         is_floor=segment_map.valid & often & shown & known & ~raised,
