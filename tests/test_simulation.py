@@ -105,7 +105,7 @@ def test_truth_is_on_the_floor_inside_and_the_rest_is_not(name, seed):
     floor, raised = world.floor_segments, world.raised_segments
     assert (floor.endpoints[..., 2] == 0).all()
     middles = floor.endpoints[:, :, :2].mean(1)
-    grown = world.corridors + [-1e-6, -1e-6, 1e-6, 1e-6]
+    grown = world.corridors + np.array([-1e-6, -1e-6, 1e-6, 1e-6])
     assert inside(grown, middles).all()
     assert (np.linalg.norm(floor.endpoints[:, 1] - floor.endpoints[:, 0], axis=-1) > 0.05).all()
     assert (raised.endpoints[..., 2].max(1) > 0).all()
@@ -124,7 +124,9 @@ def test_the_papers_blocks_have_its_width_and_spacing():
 
 def test_a_world_is_the_same_for_a_seed_and_another_for_another():
     again, other = make_world("random", 3), make_world("random", 4)
-    np.testing.assert_array_equal(again.floor_segments.endpoints, make_world("random", 3).floor_segments.endpoints)
+    np.testing.assert_array_equal(
+        again.floor_segments.endpoints, make_world("random", 3).floor_segments.endpoints
+    )
     assert again.floor_segments.endpoints.shape != other.floor_segments.endpoints.shape
 
 
@@ -162,7 +164,9 @@ def test_a_perfect_odometer_reads_the_true_path():
 def test_an_odometer_scales_left_and_right_turns_apart():
     odometer = dataclasses.replace(PERFECT, left=jnp.asarray(1.1), right=jnp.asarray(0.9))
     turns = SE2(jnp.zeros((2, 2)), jnp.array([0.2, -0.2]))
-    np.testing.assert_allclose(odometer.read(turns, jax.random.key(0)).yaw, [0.22, -0.18], rtol=1e-6)
+    np.testing.assert_allclose(
+        odometer.read(turns, jax.random.key(0)).yaw, [0.22, -0.18], rtol=1e-6
+    )
 
 
 def test_the_odometers_noise_adds_up_alike_however_the_path_is_cut():
@@ -171,7 +175,9 @@ def test_the_odometers_noise_adds_up_alike_however_the_path_is_cut():
     )
     spread = []
     for pieces in (1, 10):
-        steps = SE2(jnp.tile(jnp.array([1.0 / pieces, 0.0]), (4000 * pieces, 1)), jnp.zeros(4000 * pieces))
+        steps = SE2(
+            jnp.tile(jnp.array([1.0 / pieces, 0.0]), (4000 * pieces, 1)), jnp.zeros(4000 * pieces)
+        )
         read = odometer.read(steps, jax.random.key(1))
         for metres in (read.xy[:, 0], read.yaw):
             spread.append(float(metres.reshape(4000, pieces).sum(1).std()))
@@ -204,7 +210,10 @@ def test_the_mount_shakes_by_what_is_asked():
 
 def numpy_pose(camera_file, xy, yaw):
     """R_world_camera and C by the book: Rz Ry Rx A, plain numpy."""
-    mount = {k: float(getattr(camera_file.mount, k)) for k in ("x", "y", "height", "pitch", "roll", "yaw")}
+    mount = {
+        k: float(getattr(camera_file.mount, k))
+        for k in ("x", "y", "height", "pitch", "roll", "yaw")
+    }
 
     def rotation(axis, angle):
         c, s = np.cos(angle), np.sin(angle)
@@ -216,7 +225,13 @@ def numpy_pose(camera_file, xy, yaw):
 
     A = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float)
     Rz = rotation("z", yaw)
-    R = Rz @ rotation("z", mount["yaw"]) @ rotation("y", mount["pitch"]) @ rotation("x", mount["roll"]) @ A
+    R = (
+        Rz
+        @ rotation("z", mount["yaw"])
+        @ rotation("y", mount["pitch"])
+        @ rotation("x", mount["roll"])
+        @ A
+    )
     return R, np.array([*xy, 0]) + Rz @ [mount["x"], mount["y"], mount["height"]]
 
 
@@ -252,13 +267,15 @@ def behind_a_wall(world, foot, points, margin=0.05):
 
 
 def edge_offsets(world, camera_file, ride, frames, kinds, narrow):
-    """Distances in pixels of drawn edges from where the written truth projects, along the normal."""
+    """Distances in pixels of drawn edges from where the truth projects, along the normal."""
     artist = Artist(world, camera_file, CLEAN)
     truth = world.floor_segments
     offsets = []
     for i in frames:
         R, C = numpy_pose(camera_file, ride.truth.xy[i], ride.truth.yaw[i])
-        grey = cv2.cvtColor(artist.draw(R, C, ride.truth.stamps[i]), cv2.COLOR_BGR2GRAY).astype(np.float32)
+        grey = cv2.cvtColor(artist.draw(R, C, ride.truth.stamps[i]), cv2.COLOR_BGR2GRAY).astype(
+            np.float32
+        )
         for ends, kind in zip(truth.endpoints, truth.kinds, strict=True):
             if kind not in kinds:
                 continue
@@ -357,7 +374,9 @@ def test_walls_hide_what_is_behind_them():
         pixels = rng.integers(0, [320, 240], (300, 2))
         for u, v in pixels:
             ray = R @ np.linalg.solve(K, [u, v, 1])
-            reach, kind = (C[2] / -ray[2], 2) if ray[2] < 0 else ((world.ceiling - C[2]) / ray[2], 0)
+            reach, kind = (
+                (C[2] / -ray[2], 2) if ray[2] < 0 else ((world.ceiling - C[2]) / ray[2], 0)
+            )
             for a, b in world.walls:
                 M = np.column_stack([ray[:2], a - b])
                 if abs(np.linalg.det(M)) > 1e-9:
@@ -438,7 +457,9 @@ EXACT = Detection(
 FRAMES, DRIVES, CAPACITY = 5, 40, 24  # of all tests, so that little is compiled
 look = jax.jit(lambda *arguments: observe(*arguments, CAPACITY))
 look_many = jax.jit(
-    jax.vmap(lambda *arguments: observe(*arguments, CAPACITY), in_axes=(None, None, 0, 0, 0, 0, None))
+    jax.vmap(
+        lambda *arguments: observe(*arguments, CAPACITY), in_axes=(None, None, 0, 0, 0, 0, None)
+    )
 )
 
 
@@ -523,7 +544,9 @@ def forty_drives():
     """Stretches of one ride, each as if it were a drive."""
     ride = ride_of("paper")
     starts = jnp.arange(100, 1100, 25)[:, None] + jnp.arange(FRAMES)[None]
-    poses, mounts = (jax.tree.map(lambda leaf: leaf[starts], tree) for tree in (ride.poses(), ride.mounts))
+    poses, mounts = (
+        jax.tree.map(lambda leaf: leaf[starts], tree) for tree in (ride.poses(), ride.mounts)
+    )
     return mounts, poses, poses, jax.random.split(jax.random.key(0), DRIVES)
 
 
@@ -543,7 +566,9 @@ def test_misses_and_inventions_are_as_many_as_asked():
     def count(**changes):
         detection = dataclasses.replace(EXACT, **changes)
         observed = look_many(scene, CAMERA, *drives, detection)
-        return float(observed.segments_image.valid.sum() + observed.overflow.sum()) / (DRIVES * FRAMES)
+        return float(observed.segments_image.valid.sum() + observed.overflow.sum()) / (
+            DRIVES * FRAMES
+        )
 
     all_of_them = count()
     assert count(missed=0.5) == pytest.approx(all_of_them / 2, rel=0.1)
@@ -676,5 +701,7 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path, capsys):
 def test_increments_of_a_path_begin_with_none():
     steps = increments(ride_of("l").truth)
     assert float(steps.xy[0, 0]) == 0 and float(steps.yaw[0]) == 0
-    pairs = itertools.islice(zip(ride_of("l").truth.yaw[1:], ride_of("l").truth.yaw, strict=False), 5)
+    pairs = itertools.islice(
+        zip(ride_of("l").truth.yaw[1:], ride_of("l").truth.yaw, strict=False), 5
+    )
     np.testing.assert_allclose([a - b for a, b in pairs], steps.yaw[1:6], atol=1e-6)

@@ -28,7 +28,7 @@ def floor_homography(drive: Drive, pose: np.ndarray) -> np.ndarray:
     Rz = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     R = (Rz @ np.asarray(rotation_robot_camera(mount), float)).T
     arm = Rz @ [float(mount.x), float(mount.y), float(mount.height)]
-    P = K @ np.column_stack([R, -R @ (arm + [pose[0], pose[1], 0])])
+    P = K @ np.column_stack([R, -R @ (arm + np.append(pose[:2], 0))])
     return P[:, [0, 1, 3]]
 
 
@@ -66,13 +66,24 @@ def visible(H_F: np.ndarray, size: tuple, foot: np.ndarray, points: np.ndarray, 
     x = np.column_stack([points, np.ones(len(points))]) @ H_F.T
     depth = np.where(x[:, 2] > 0.1, x[:, 2], np.inf)
     u, v = x[:, 0] / depth, x[:, 1] / depth
-    ok = (x[:, 2] > 0.1) & (x[:, 2] < RANGE) & (u > 0) & (v > 0) & (u < size[0] - 1) & (v < size[1] - 1)
+    ok = (
+        (x[:, 2] > 0.1)
+        & (x[:, 2] < RANGE)
+        & (u > 0)
+        & (v > 0)
+        & (u < size[0] - 1)
+        & (v < size[1] - 1)
+    )
     for a, b in walls:
+
         def side(p, q, r):
             return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
                 r[..., 0] - p[..., 0]
             )
-        near = points + 0.05 * (foot - points) / np.linalg.norm(foot - points, axis=1, keepdims=True)
+
+        near = points + 0.05 * (foot - points) / np.linalg.norm(
+            foot - points, axis=1, keepdims=True
+        )
         crosses = (side(a, b, near) * side(a, b, foot) < 0) & (
             side(foot, near, a[None]) * side(foot, near, b[None]) < 0
         )
@@ -83,7 +94,9 @@ def visible(H_F: np.ndarray, size: tuple, foot: np.ndarray, points: np.ndarray, 
 def measure(path: Path, detector: str, every: int) -> dict[str, float]:
     drive = read_drive(path)
     truth = drive.floor_segments
-    kinds = [line.split(",")[4].strip() for line in open(path / "floor_segments.csv") if line[0] != "#"]
+    kinds = [
+        line.split(",")[4].strip() for line in open(path / "floor_segments.csv") if line[0] != "#"
+    ]
     walls = truth[[kind == "wall" for kind in kinds]]
     samples = []
     for a, b in truth:
@@ -114,7 +127,9 @@ def measure(path: Path, detector: str, every: int) -> dict[str, float]:
             ends = found[rows]
             d = ends[:, 1] - ends[:, 0]
             s = ((in_view[:, None] - ends[:, 0]) * d).sum(-1) / (d**2).sum(-1)
-            gap = np.linalg.norm(in_view[:, None] - ends[:, 0] - np.clip(s, 0, 1)[..., None] * d, axis=-1)
+            gap = np.linalg.norm(
+                in_view[:, None] - ends[:, 0] - np.clip(s, 0, 1)[..., None] * d, axis=-1
+            )
             hit += int((gap.min(1) < 0.05).sum())
         seen += len(in_view)
     return {
@@ -127,7 +142,9 @@ def measure(path: Path, detector: str, every: int) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("drives", metavar="DRIVE", nargs="+", type=Path)
     parser.add_argument("--detector", choices=sorted(DETECTORS), default="lsd")
     parser.add_argument("--every", type=int, default=5)

@@ -39,7 +39,9 @@ def one(seed: int, folder: Path, settings: list[str]) -> dict[str, object]:
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            codes = [sofjax(["simulate", "--world", "random", "--seed", str(seed), "--out", str(drive)])]
+            codes = [
+                sofjax(["simulate", "--world", "random", "--seed", str(seed), "--out", str(drive)])
+            ]
             codes += [sofjax(["run", str(drive), "--out", str(out), *settings])]
         if any(codes):
             row["failure"] = f"exit codes {codes}: {said.getvalue()[-300:]!r}"
@@ -97,7 +99,7 @@ def summary(results: Path) -> str:
     wheel = np.array([float(row["odometry_percent"]) for row in done])
     quantiles = (50, 75, 90, 95, 100)
     lines = [
-        f"{len(rows)} worlds, {len(failed)} failed, {(ate <= 1).sum()} with ate of 1 % of the path or less",
+        f"{len(rows)} worlds: {len(failed)} failed, {(ate <= 1).sum()} at 1 % or less",
         "| % of the path | " + " | ".join(f"{q} %" for q in quantiles) + " |",
         "|---|" + "---|" * len(quantiles),
         "| sofjax | " + " | ".join(f"{np.percentile(ate, q):.2f}" for q in quantiles) + " |",
@@ -105,7 +107,9 @@ def summary(results: Path) -> str:
     ]
     for floor in sorted({row["floor"] for row in done}):
         mine = ate[[row["floor"] == floor for row in done]]
-        lines.append(f"{floor}: {len(mine)} worlds, median {np.median(mine):.2f} %, worst {mine.max():.2f} %")
+        lines.append(
+            f"{floor}: {len(mine)} worlds, median {np.median(mine):.2f} %, worst {mine.max():.2f} %"
+        )
     for row in failed:
         lines.append(f"seed {row['seed']} failed: {row['failure']}")
     for row in sorted(done, key=lambda row: -float(row["ate_percent"])):
@@ -119,11 +123,15 @@ def summary(results: Path) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--worlds", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--results", type=Path, default=Path(__file__).with_name("results.csv"))
-    parser.add_argument("--set", metavar="name=value", nargs="+", default=[], help="of `sofjax run`")
+    parser.add_argument(
+        "--set", metavar="name=value", nargs="+", default=[], help="of `sofjax run`"
+    )
     args = parser.parse_args()
     settings = ["--set", *args.set] if args.set else []
     known = set()
@@ -140,7 +148,14 @@ def main() -> None:
                 writer.writeheader()
             row = {name: f"{v:.5g}" if isinstance(v, float) else v for name, v in row.items()}
             writer.writerow(row)
-        print(seed, row["floor"], row.get("ate_percent"), row["failure"], f"{row['seconds']} s", flush=True)
+        print(
+            seed,
+            row["floor"],
+            row.get("ate_percent"),
+            row["failure"],
+            f"{row['seconds']} s",
+            flush=True,
+        )
     print(summary(args.results))
 
 

@@ -17,7 +17,10 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: runs/demo-<time>/")
     parser.add_argument(
-        "--world", metavar="NAME", default="paper", help="paper, l, t, eight or random; default paper"
+        "--world",
+        metavar="NAME",
+        default="paper",
+        help="paper, l, t, eight or random; default paper",
     )
     parser.add_argument("--seed", metavar="S", type=int, default=3, help="of the world; default 3")
     parser.set_defaults(run=run)
@@ -79,24 +82,24 @@ def page(report: dict, drive: Path, pictures: bool) -> str:
 <meta charset="utf-8">
 <title>sofjax: a drive and its map</title>
 <style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem }}
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: auto; padding: 1rem }}
 img {{ max-width: 100% }}
 table {{ border-collapse: collapse }}
 td, th {{ padding: .2rem 1rem; border-bottom: 1px solid #ccc; text-align: left }}
 </style>
 <h1>One camera, two wheels and a flat floor</h1>
-<p>A robot was driven {found["path_m"]:.0f} m through a corridor that exists in the computer only, so
-that the truth is known to the millimetre. It has one camera, and an odometer that counts the turns of
-its wheels and is wrong about them.</p>
+<p>A robot was driven {found["path_m"]:.0f} m through a corridor that exists in the computer only,
+so that the truth is known to the millimetre. It has one camera, and an odometer that counts the
+turns of its wheels and is wrong about them.</p>
 <h2>What it sees</h2>
 <p><img src="drive/rgb/{middle}" alt="an image of the camera"></p>
-<p>In each of {images} images, straight segments are found. Those that move from image to image as the
-floor does are used; the others, such as door frames and the tops of baseboards, are not on the floor
-and would mislead.</p>
+<p>In each of {images} images, straight segments are found. Those that move from image to image as
+the floor does are used; the others, such as door frames and rails, are not on the floor and would
+mislead.</p>
 {picture(IMAGES, "segments on the floor and others")}
 <h2>Where it went, and the map that it made on the way</h2>
-<p>Dashed is the path by the odometer alone: the corners turn in too far, and the error grows. Red is the
-estimate; grey, mostly hidden under it, is the truth. Blue are the segments of the map.</p>
+<p>Dashed is the path by the odometer alone: the corners turn in too far, and errors grow. Red is
+the estimate; grey, mostly hidden under it, is the truth. Blue are the segments of the map.</p>
 {picture("run/map.png", "the path and the map")}
 <table>
 <tr><th></th><th>odometer alone</th><th>sofjax</th></tr>
@@ -108,7 +111,7 @@ estimate; grey, mostly hidden under it, is the truth. Blue are the segments of t
 <p>The map has {of_map["segments"]} segments; of their length {100 * of_map["precision"]:.0f} % lies
 within 5 cm of a true line on the floor.</p>
 <h2>On your own drive</h2>
-<p><code>drive/</code> shows the files that a drive needs; <code>sofjax inspect DRIVE</code> checks them, and
-<code>sofjax run DRIVE</code> does what was done here.</p>
+<p><code>drive/</code> shows the files that a drive needs; <code>sofjax inspect DRIVE</code> checks
+them, and <code>sofjax run DRIVE</code> does what was done here.</p>
 </html>
 """

@@ -25,11 +25,13 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--out", metavar="DRIVE", type=Path, required=True, help="a new folder")
     parser.add_argument("--world", metavar="NAME", default="paper", help=WORLD_HELP)
     parser.add_argument(
-        "--seed", metavar="S", type=int, default=0, help="of the corridor's look, the drive and the "
+        "--seed", metavar="S", type=int, default=0, help="of the look, the drive and the "
         "noise; in the world 'random' also of the plan, the camera and the odometer"
     )  # fmt: skip
     parser.add_argument(
-        "--way", metavar="'x,y x,y ...'", help="points to drive along instead of the world's own, metres"
+        "--way",
+        metavar="'x,y x,y ...'",
+        help="points to drive along instead of the world's own, metres",
     )
     parser.add_argument("--images", metavar="N", type=int, help="stop after so many")
     mount = parser.add_argument_group("the camera on the robot")
@@ -46,15 +48,23 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
     camera.add_argument("--size", metavar="WxH", help="pixels; default 320x240")
     camera.add_argument("--focal", metavar="PX", type=float, help="pixels; default 291 at 320x240")
     camera.add_argument(
-        "--distortion", metavar="k", nargs="+", type=float, help="k1 k2 p1 p2 k3 as OpenCV's plumb_bob"
+        "--distortion",
+        metavar="k",
+        nargs="+",
+        type=float,
+        help="k1 k2 p1 p2 k3 as OpenCV's plumb_bob",
     )
     camera.add_argument("--noise", metavar="GREY", type=float, help="grey values; default 2.5")
-    camera.add_argument("--blur", metavar="PX", type=float, help="of the lens, pixels; default 0.55")
+    camera.add_argument(
+        "--blur", metavar="PX", type=float, help="of the lens, pixels; default 0.55"
+    )
     robot = parser.add_argument_group("the robot")
     robot.add_argument("--speed", metavar="M/S", type=float, help="metres a second; default 0.7")
     robot.add_argument("--wobble", metavar="RAD/S", type=float, help="of the hand; default 0.05")
     robot.add_argument("--vibration", metavar="DEG", type=float, help="of the mount; default 0.1")
-    robot.add_argument("--dropped", metavar="SHARE", type=float, help="of the readings; default 0.01")
+    robot.add_argument(
+        "--dropped", metavar="SHARE", type=float, help="of the readings; default 0.01"
+    )
     robot.add_argument(
         "--odometer",
         metavar="name=value",
@@ -110,12 +120,16 @@ def choose_rig(args: argparse.Namespace) -> "Rig":
             if not np.isfinite(value) or abs(value) > (180 if name in ("roll", "yaw") else 90):
                 raise InputError(f"--{name} is {value:g}; that is no place for a camera")
             metric = np.radians(value) if name in ("pitch", "roll", "yaw") else value
-            mount = eqx.tree_at(lambda m, name=name: getattr(m, name), mount, jnp.asarray(metric, float))
+            mount = eqx.tree_at(
+                lambda m, name=name: getattr(m, name), mount, jnp.asarray(metric, float)
+            )
     width, height = _size(args.size)
     usual = float(rig.camera_file.camera.K[0, 0]) * width / 320
     focal = usual if args.focal is None else args.focal
     if not 0.2 * width <= focal <= 20 * width:
-        raise InputError(f"--focal is {focal:g} px; for {width} pixels it must be {0.2 * width:g} or more")
+        raise InputError(
+            f"--focal is {focal:g} px; for {width} pixels it must be {0.2 * width:g} or more"
+        )
     distortion = rig.camera_file.distortion
     if args.distortion is not None:
         distortion = args.distortion

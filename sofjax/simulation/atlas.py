@@ -1,4 +1,4 @@
-"""Every surface of a world painted into one image, the atlas, that rays look their colours up in."""
+"""Every surface of a world painted into one image, the atlas, where rays find their colours."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ NOISE_SIDE = 1024
 
 @dataclass(frozen=True)
 class Picture:
-    """Where a surface lies in the atlas: metres (a, b) at column `origin[0] + texels * a`, row likewise."""
+    """Where a surface is in the atlas: metres (a, b) at column, row `origin + texels * (a, b)`."""
 
     origin: Float[np.ndarray, "2"]
     texels: float
@@ -158,7 +158,9 @@ class Light:
 
 def grain(rng: np.random.Generator) -> Float[np.ndarray, "side side"]:
     """A texture that repeats without a seam, from coarse mottling to single texels; variance 1."""
-    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(NOISE_SIDE), np.fft.rfftfreq(NOISE_SIDE), indexing="ij"))
+    frequency = np.hypot(
+        *np.meshgrid(np.fft.fftfreq(NOISE_SIDE), np.fft.rfftfreq(NOISE_SIDE), indexing="ij")
+    )
     amplitude = (frequency + 1.5 / NOISE_SIDE) ** -0.9
     amplitude[0, 0] = 0
     spectrum = np.fft.rfft2(rng.standard_normal((NOISE_SIDE, NOISE_SIDE))) * amplitude
@@ -172,7 +174,9 @@ def _shade(picture: np.ndarray, noise: np.ndarray, amplitude: float, light: np.n
     row_at = np.linspace(0, light.shape[0] - 1, rows)
     column_at = np.linspace(0, light.shape[1] - 1, columns)
     per_column = np.array([np.interp(column_at, np.arange(light.shape[1]), line) for line in light])
-    texture = np.tile(1 + np.float32(amplitude) * noise, (1, columns // NOISE_SIDE + 1))[:, :columns]
+    texture = np.tile(1 + np.float32(amplitude) * noise, (1, columns // NOISE_SIDE + 1))[
+        :, :columns
+    ]
     for first in range(0, rows, NOISE_SIDE):
         part = slice(first, min(first + NOISE_SIDE, rows))
         below = np.minimum(row_at[part].astype(int), light.shape[0] - 2)
@@ -187,13 +191,19 @@ def paint_area(
     corners: Float[np.ndarray, "4 2"],
     colour: Float[np.ndarray, "3"],
 ) -> None:
-    """Paint a convex polygon whose edge texels are covered in part; corners in texels, whose middles
-    are whole numbers, counter-clockwise as x and y go."""
+    """Paint a convex polygon; the texels on its edges are covered in part.
+
+    **Arguments:**
+    - `corners`: in texels, whose middles are whole numbers; counter-clockwise as x and y go.
+    """
     low = np.maximum(np.floor(corners.min(0)).astype(int), 0)
     high = np.minimum(np.ceil(corners.max(0)).astype(int) + 1, picture.shape[1::-1])
     if (low >= high).any():
         return
-    x, y = np.arange(low[0], high[0], dtype=np.float32), np.arange(low[1], high[1], dtype=np.float32)
+    x, y = (
+        np.arange(low[0], high[0], dtype=np.float32),
+        np.arange(low[1], high[1], dtype=np.float32),
+    )
     cover = np.ones((len(y), len(x)), np.float32)
     following = np.roll(corners, -1, axis=0)
     normals = left_normal(following - corners)
@@ -221,7 +231,11 @@ def _floor(world: World, low: np.ndarray, size: np.ndarray, texels: float) -> np
     order = [
         *((c, k) for c, k, tone in zip(areas.corners, areas.colours, under, strict=True) if tone),
         *zip(thin, lines.colours, strict=True),
-        *((c, k) for c, k, tone in zip(areas.corners, areas.colours, under, strict=True) if not tone),
+        *(
+            (c, k)
+            for c, k, tone in zip(areas.corners, areas.colours, under, strict=True)
+            if not tone
+        ),
     ]
     for corners, colour in order:
         paint_area(picture, _counter_clockwise((corners - low) * texels - 0.5), colour)
@@ -241,9 +255,7 @@ def _ceiling(world: World, low: np.ndarray, size: np.ndarray) -> np.ndarray:
     return picture
 
 
-def _faces(
-    world: World, texels: float, sheet: _Sheet, noise: np.ndarray, light: Light
-) -> Faces:
+def _faces(world: World, texels: float, sheet: _Sheet, noise: np.ndarray, light: Light) -> Faces:
     """Paint the walls and the sides of the boxes."""
     feet, heights, pictures = [], [], []
     areas = world.wall_areas

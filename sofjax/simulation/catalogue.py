@@ -1,10 +1,19 @@
 """The worlds that can be asked for by name."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 
 from sofjax.io.errors import InputError, nearest
-from sofjax.simulation.fittings import FLOORS, Paint, Plan, contrasting, fit_walls, hang_lamps, put_boxes
+from sofjax.simulation.fittings import (
+    FLOORS,
+    Paint,
+    Plan,
+    fit_walls,
+    hang_lamps,
+    put_boxes,
+)
 from sofjax.simulation.plan import distance_to_way, inside, union_walls
 from sofjax.simulation.worlds import Look, World
 
@@ -69,7 +78,7 @@ def check_way(corridors: Float[np.ndarray, "n 4"], way: Float[np.ndarray, "point
     if len(way) < 2:
         raise InputError("a way needs two points at least")
     walls = union_walls(corridors)
-    for a, b in zip(way[:-1], way[1:], strict=True):
+    for a, b in itertools.pairwise(way):
         steps = np.linspace(0, 1, max(2, int(np.linalg.norm(b - a) / 0.05)))
         points = a + steps[:, None] * (b - a)
         for outside in points[~inside(corridors, points)][:1]:
@@ -93,7 +102,7 @@ def around(points: np.ndarray, width: float) -> Float[np.ndarray, "n 4"]:
 
 
 def _paper(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
-    """The paper's loop of 11.5 m × 24 m, clockwise, its first stretch driven again; section IV.A."""
+    """The paper's loop of 11.5 m × 24 m, clockwise, its begin driven again; section IV.A."""
     loop = np.array([[0, 0], [0, 24], [11.5, 24], [11.5, 0], [0, 0]], float)
     way = np.array([[0, 1], [0, 24], [11.5, 24], [11.5, 0], [0, 0], [0, 8]], float)
     return around(loop, 2.2), way, "blocks"

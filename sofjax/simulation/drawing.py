@@ -44,7 +44,12 @@ class Imaging:
         """Refuse a camera that cannot be, in a sentence."""
         for name, value in vars(self).items():
             if not 0 <= value < math.inf:
-                raise InputError(f"the camera's {name.replace('_', ' ')} is {value:g}; 0 is the least")
+                raise InputError(
+                    f"the camera's {name.replace('_', ' ')} is {value:g}; 0 is the least"
+                )
+
+
+WEBCAM = Imaging()
 
 
 class Artist:
@@ -89,7 +94,9 @@ class Artist:
             np.asarray(rows).reshape(shape),
             cv2.INTER_LINEAR,
         )
-        image = colours.reshape(len(RAYS), height, width, 3).sum(0, dtype=np.uint16).astype(np.float32)
+        image = (
+            colours.reshape(len(RAYS), height, width, 3).sum(0, dtype=np.uint16).astype(np.float32)
+        )
         image *= np.float32(1 / len(RAYS))
         mirrored = self._mirrored(gleam)
         image += mirrored[..., None]
@@ -100,7 +107,9 @@ class Artist:
         height, width = self._camera.height, self._camera.width
         columns, rows = (np.asarray(v).reshape(len(SPREAD) * height, width) for v in gleam[:2])
         strength = np.asarray(gleam[2]).reshape(height, width)
-        lamps = cv2.remap(self._mirror, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        lamps = cv2.remap(
+            self._mirror, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+        )
         return lamps.reshape(len(SPREAD), height, width).mean(0) * strength * np.float32(255)
 
     def _develop(self, image: np.ndarray, stamp: float, turn_rate: float) -> np.ndarray:
@@ -125,7 +134,9 @@ class Artist:
         return np.float32(self._exposure * (1 + self._imaging.hunting * sway / 1.5))
 
     def _noise(self, shape: tuple[int, ...]) -> Float32[np.ndarray, "height width 3"]:
-        draws = self._rng.standard_normal((*shape[:2], 2), np.float32) * np.float32(self._imaging.noise)
+        draws = self._rng.standard_normal((*shape[:2], 2), np.float32) * np.float32(
+            self._imaging.noise
+        )
         grey, tint = draws[..., :1], draws[..., 1:]
         return np.concatenate([grey, grey + 0.3 * tint, grey - 0.3 * tint], axis=-1)
 
@@ -236,8 +247,8 @@ def cast(
     Nearness, the inverse of the distance along a ray, is affine in its direction for every plane,
     so the nearest surface is found without a division.
 
-    **Returns:** columns and rows of the atlas [rays]; and for the first ray of every pixel the columns
-    and rows [SPREAD, pixels] of the lamps that it sees mirrored, and how strongly.
+    **Returns:** columns and rows of the atlas [rays]; and for the first ray of every pixel the
+    columns and rows [SPREAD, pixels] of the lamps that it sees mirrored, and how strongly.
     """
     x, y, height, ceiling, texels, gloss, low_x, low_y = scene[:8]
     dx, dy, dz = R_world_camera @ rays

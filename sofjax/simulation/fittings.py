@@ -56,7 +56,11 @@ class Paint:
 
 
 def contrasting(
-    rng: np.random.Generator, colour: np.ndarray, low: float, high: float, darker: bool | None = None
+    rng: np.random.Generator,
+    colour: np.ndarray,
+    low: float,
+    high: float,
+    darker: bool | None = None,
 ) -> Float[np.ndarray, "3"]:
     """A colour whose brightness differs from another's by `low` to `high`, darker or lighter."""
     value = brightness(colour)
@@ -108,7 +112,9 @@ def grid(
     colour = contrasting(rng, floor, 0.18, 0.32, darker=bool(rng.random() < 0.8))
     width = rng.uniform(0.007, 0.012)
     centre = (plan.corridors[:, :2].min(0) + plan.corridors[:, 2:].max(0)) / 2
-    reach = np.linalg.norm(plan.corridors[:, 2:].max(0) - plan.corridors[:, :2].min(0)) / 2 + spacing
+    reach = (
+        np.linalg.norm(plan.corridors[:, 2:].max(0) - plan.corridors[:, :2].min(0)) / 2 + spacing
+    )
     centre = centre + rng.uniform(0, spacing, 2)
     for turn in (angle, angle + np.pi / 2):
         d = np.array([np.cos(turn), np.sin(turn)])
@@ -193,7 +199,9 @@ class Plan:
             if rect[0] >= x1 or rect[2] <= x0 or rect[1] >= y1 or rect[3] <= y0:
                 continue
             a, b = rect[axis], rect[axis + 2]
-            free = [p for c, d in free for p in ((c, min(d, a)), (max(c, b), d)) if p[1] - p[0] > 1e-9]
+            free = [
+                p for c, d in free for p in ((c, min(d, a)), (max(c, b), d)) if p[1] - p[0] > 1e-9
+            ]
         return free
 
 
@@ -279,10 +287,15 @@ def put_boxes(
         d = (end - start) / length
         n = left_normal(d)
         s = rng.uniform(0.5, length - width - 0.5)
-        corners = start + np.array([s, s + width])[:, None] * d + np.array([0.02, depth])[:, None] * n
+        corners = (
+            start + np.array([s, s + width])[:, None] * d + np.array([0.02, depth])[:, None] * n
+        )
         box = np.concatenate([corners.min(0), corners.max(0)])
         gaps = [np.maximum(box[:2] - other[2:4], other[:2] - box[2:]).max() for other in boxes]
-        if distance_to_way(plan.way, rectangle(*box)).min() > clearance and min(gaps, default=1) > 0:
+        if (
+            distance_to_way(plan.way, rectangle(*box)).min() > clearance
+            and min(gaps, default=1) > 0
+        ):
             boxes.append(np.append(box, rng.choice([0.3, 0.45, 0.8, 1.5])))
             colours.append(0.6 * rng.uniform(0.1, 0.8) + 0.4 * rng.uniform(0.1, 0.8, 3))
     return np.array(boxes, float).reshape(-1, 5), np.array(colours, float).reshape(-1, 3)

@@ -1,5 +1,7 @@
 """The plan of a corridor: the union of rectangles, the walls around it, what lies inside."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -54,7 +56,7 @@ def wall_directions(walls: Float[np.ndarray, "walls 2 2"]) -> Float[np.ndarray, 
 def parts_inside(
     corridors: Float[np.ndarray, "n 4"], segment: Float[np.ndarray, "2 2"], shortest: float = 0.1
 ) -> list[np.ndarray]:
-    """The parts of a segment that lie in the union of rectangles, at least `shortest` metres long."""
+    """The parts of a segment in the union of rectangles, at least `shortest` metres long."""
     start, way = segment[0], segment[1] - segment[0]
     parts = []
     for x0, y0, x1, y1 in corridors:
@@ -75,7 +77,9 @@ def parts_inside(
         else:
             merged.append([first, last])
     length = float(np.linalg.norm(way))
-    return [start + np.outer(part, way) for part in merged if (part[1] - part[0]) * length > shortest]
+    return [
+        start + np.outer(part, way) for part in merged if (part[1] - part[0]) * length > shortest
+    ]
 
 
 def offset_walls(
@@ -95,7 +99,7 @@ def distance_to_way(
 ) -> Float[np.ndarray, "points"]:
     """Distance of points from a broken line, metres."""
     best = np.full(len(points), np.inf)
-    for a, b in zip(way[:-1], way[1:], strict=True):
+    for a, b in itertools.pairwise(way):
         d = b - a
         s = np.clip((points - a) @ d / max(d @ d, 1e-12), 0, 1)
         best = np.minimum(best, np.linalg.norm(points - (a + s[:, None] * d), axis=-1))

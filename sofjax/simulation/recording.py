@@ -8,7 +8,7 @@ from sofjax.io.camera_file import write_camera
 from sofjax.io.errors import InputError
 from sofjax.io.text import write_atomically
 from sofjax.io.trajectory import Trajectory, TrajectoryWriter
-from sofjax.simulation.drawing import Artist, Imaging, write_image
+from sofjax.simulation.drawing import WEBCAM, Artist, Imaging, write_image
 from sofjax.simulation.rides import Ride, Rig
 from sofjax.simulation.worlds import World
 
@@ -18,7 +18,7 @@ def record(
     world: World,
     rig: Rig,
     ride: Ride,
-    imaging: Imaging = Imaging(),
+    imaging: Imaging = WEBCAM,
     seed: int = 0,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> None:

@@ -19,7 +19,6 @@ from sofjax.simulation.plan import inside
 from sofjax.simulation.robots import Driver, Odometer, drive_along, increments, read_path
 from sofjax.simulation.worlds import World
 
-
 PAPER_MOUNT = Mount.create(height=1.0, pitch=math.radians(12), x=0.1)
 
 
@@ -30,7 +29,7 @@ def webcam(
     height: int = 240,
     distortion: Sequence[float] | np.ndarray = (-0.09, 0.03, 0.0006, -0.0004, 0.0),
 ) -> CameraFile:
-    """A camera like the paper's on top of the robot, looking at the middle; pixels. Section IV.A."""
+    """A camera like the paper's, on top of the robot; pixels. Section IV.A."""
     K = jnp.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], float)
     camera = Camera(K, width, height)
     return CameraFile(camera, mount, np.array(distortion, float), "plumb_bob", "simulated")
@@ -41,7 +40,7 @@ class Rig:
     """A robot with its camera, its odometer and its driver."""
 
     camera_file: CameraFile = field(default_factory=webcam)
-    driver: Driver = Driver()
+    driver: Driver = field(default_factory=Driver)
     odometer: Odometer = field(default_factory=Odometer)
     image_rate: float = 10.0  # images a second
     odometry_rate: float = 25.0  # readings a second
@@ -116,7 +115,9 @@ def take_ride(world: World, rig: Rig, seed: int = 0, most_images: int | None = N
     odometry = Trajectory(odometry.stamps[kept], odometry.xy[kept], odometry.yaw[kept])
     before, after = path.at(stamps - 0.02), path.at(stamps + 0.02)
     speed = np.linalg.norm(after.xy - before.xy, axis=-1) / 0.04
-    shake = rig.vibration * (speed / rig.driver.speed)[:, None] * rng.standard_normal((len(stamps), 2))
+    shake = (
+        rig.vibration * (speed / rig.driver.speed)[:, None] * rng.standard_normal((len(stamps), 2))
+    )
     turn_rate = (after.yaw - before.yaw) / 0.04
     ride = Ride(truth, turn_rate, odometry, _shaken(rig.camera_file.mount, shake))
     C = ride.camera_poses()[1]
@@ -151,7 +152,9 @@ def check_rig(world: World, rig: Rig) -> None:
         )
     right, bottom = camera.width - 1, camera.height - 1
     corners = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1]])
-    if (corners @ horizon_image(np.asarray(camera.K), float(mount.pitch), float(mount.roll)) <= 0).all():
+    if (
+        corners @ horizon_image(np.asarray(camera.K), float(mount.pitch), float(mount.roll)) <= 0
+    ).all():
         raise InputError(
             f"with a pitch of {math.degrees(mount.pitch):g} degrees the camera sees no floor; "
             "pitch > 0 looks down"
@@ -172,7 +175,9 @@ def check_rig(world: World, rig: Rig) -> None:
         if not 0 <= float(value) < math.inf:
             raise InputError(f"the {name} is {float(value):g}; it must be 0 or more")
     if rig.dropped > 0.9:
-        raise InputError(f"of the readings a share of {rig.dropped:g} is dropped; at most 0.9 may be")
+        raise InputError(
+            f"of the readings a share of {rig.dropped:g} is dropped; at most 0.9 may be"
+        )
     for name, value, unit in (
         ("speed", rig.driver.speed, "metres a second"),
         ("turn rate", rig.driver.turn_rate, "radians a second"),
@@ -182,7 +187,9 @@ def check_rig(world: World, rig: Rig) -> None:
         if not 0 < value < math.inf:
             raise InputError(f"the {name} is {value:g}; it must be more than 0 {unit}")
     if rig.driver.speed > 2:
-        raise InputError(f"at {rig.driver.speed:g} m/s a robot cannot take these bends; at most 2 may be")
+        raise InputError(
+            f"at {rig.driver.speed:g} m/s a robot cannot take these bends; at most 2 may be"
+        )
 
 
 @jax.jit

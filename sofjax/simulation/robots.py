@@ -1,5 +1,6 @@
 """A robot that a hand drives along a way, and the odometer that reads its motion wrongly."""
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,7 @@ class Driver:
 def drive_along(
     way: Float[np.ndarray, "points 2"], driver: Driver, rng: np.random.Generator
 ) -> Trajectory:
-    """Drive from the first point of a way to the last: slower in bends, on the spot where it turns back.
+    """Drive along a way: slower in bends, and turning on the spot where the way turns back.
 
     **Returns:** true poses every `STEP` seconds from 0, from rest to rest.
     """
@@ -45,7 +46,9 @@ def drive_along(
             rest = arc[-1] - progress
             error = _heading(_point(section, arc, progress + driver.look_ahead) - at) - yaw
             error = (error + np.pi) % (2 * np.pi) - np.pi
-            hand += -hand * STEP / 1.5 + driver.wobble * np.sqrt(STEP / 0.75) * rng.standard_normal()
+            hand += (
+                -hand * STEP / 1.5 + driver.wobble * np.sqrt(STEP / 0.75) * rng.standard_normal()
+            )
             wanted_turn = np.clip(1.8 * error, -driver.turn_rate, driver.turn_rate) + hand
             braking = np.sqrt(driver.acceleration * (rest + 0.02))
             wanted = min(driver.speed * max(0.0, np.cos(1.5 * min(abs(error), 1.0))) ** 2, braking)
@@ -70,7 +73,7 @@ def _sections(way: np.ndarray) -> list[np.ndarray]:
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     backs = np.flatnonzero((d[1:] * d[:-1]).sum(1) < -0.5) + 1
     ends = [0, *backs, len(way) - 1]
-    return [way[a : b + 1] for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [way[a : b + 1] for a, b in itertools.pairwise(ends)]
 
 
 def _point(way: np.ndarray, arc: np.ndarray, s: float) -> np.ndarray:
@@ -119,7 +122,9 @@ class Odometer(eqx.Module):
         noise_key, slip_key, wheel_key = jax.random.split(key, 3)
         distance_draw, heading_draw, turn_draw = jax.random.normal(noise_key, (3, *turn.shape))
         distance = jnp.abs(forward)
-        read_forward = forward * self.distance + self.distance_noise * jnp.sqrt(distance) * distance_draw
+        read_forward = (
+            forward * self.distance + self.distance_noise * jnp.sqrt(distance) * distance_draw
+        )
         read_turn = (
             turn * jnp.where(turn > 0, self.left, self.right)
             + self.bend * forward
@@ -155,7 +160,9 @@ def read_path(odometer: Odometer, truth: Trajectory, key: PRNGKeyArray) -> Traje
     yaw = np.cumsum(turns)
     before = yaw - turns
     c, s = np.cos(before), np.sin(before)
-    xy = np.cumsum(np.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]], -1), 0)
+    xy = np.cumsum(
+        np.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]], -1), 0
+    )
     return Trajectory(truth.stamps, xy, yaw)
 
 

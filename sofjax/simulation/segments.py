@@ -72,6 +72,9 @@ class Detection(eqx.Module):
     max_depth: float = 10.0  # metres
 
 
+LSD = Detection()
+
+
 def observe(
     scene: Scene,
     camera: Camera,
@@ -79,7 +82,7 @@ def observe(
     T_world_robot: SE2,
     motion: SE2,
     key: PRNGKeyArray,
-    detection: Detection = Detection(),
+    detection: Detection = LSD,
     capacity: int = 64,
 ) -> Observation:
     """What the filter takes, straight from a world; under `jax.jit`, and `jax.vmap` over drives.
@@ -213,7 +216,7 @@ def unhidden(
 
 
 def shadow(wall: Float[Array, "2 2"], plan: Float[Array, "2 2"]) -> Float[Array, "2"]:
-    """Shares (from, to) of an edge in the plan that lie in a wall's shadow, the eye at the origin."""
+    """Shares (from, to) of an edge in the plan in a wall's shadow, the eye at the origin."""
     a, b = wall
     turn = jnp.sign(_cross(a, b))
     beyond = turn * safe_divide(_cross(b - a, plan - a[None]), safe_norm(b - a)) * -1

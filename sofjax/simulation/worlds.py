@@ -57,7 +57,9 @@ class World:
     """
 
     name: str
-    corridors: Float[np.ndarray, "n 4"]  # x_min, y_min, x_max, y_max, metres; the floor is their union
+    corridors: Float[
+        np.ndarray, "n 4"
+    ]  # x_min, y_min, x_max, y_max, metres; the floor is their union
     walls: Float[np.ndarray, "walls 2 2"]  # end points on the floor, the corridor on their left
     ceiling: float  # height, metres
     way: Float[np.ndarray, "points 2"]  # centre line to drive along, metres
@@ -73,7 +75,7 @@ class World:
 
     @cached_property
     def floor_segments(self) -> Segments3D:
-        """The true segments on the floor: foot of the walls, painted edges, centres of narrow lines."""
+        """The truth: foot of the walls, edges of painted areas, centres of narrow lines."""
         floor = brightness(self.look.floor)
         found = _Found()
         for i, wall in enumerate(self.walls):
@@ -93,7 +95,7 @@ class World:
 
     @cached_property
     def raised_segments(self) -> Segments3D:
-        """Edges that are not on the floor: of baseboards, doors, boards, rails, lamps, boxes, corners."""
+        """Edges that are not on the floor: of doors, boards, rails, lamps, boxes, corners."""
         found = _Found()
         wall_brightness = brightness(self.look.wall)
         areas = self.wall_areas
@@ -126,7 +128,9 @@ class World:
         found = _Found()
         for lamp, light in zip(self.lamps, self.lamp_light, strict=True):
             for edge in outline(lamp):
-                found.add("reflection", on_plane(edge, -self.ceiling), 0.1 * self.look.gloss * light)
+                found.add(
+                    "reflection", on_plane(edge, -self.ceiling), 0.1 * self.look.gloss * light
+                )
         return found.segments()
 
     def _foot_brightness(self, wall: int) -> float:
