@@ -327,7 +327,7 @@ def test_written_truth_lands_on_the_drawn_edges():
     world = dataclasses.replace(world_of("paper", 3), **NO_BOXES)
     ride = ride_of("paper", 3)
     mount = Mount.create(height=1.0, pitch=0.21, x=0.1, y=0.03, roll=0.02, yaw=-0.03)
-    frames = range(5, len(ride.truth.stamps), 120)
+    frames = range(5, len(ride.truth.stamps), 200)
     offsets = edge_offsets(world, webcam(mount), ride, frames, {"mark", "wall"}, narrow=False)
     assert len(offsets) > 100
     assert np.abs(np.median(offsets)) < 0.05

@@ -85,8 +85,8 @@ def _point(way: np.ndarray, arc: np.ndarray, s: float) -> np.ndarray:
 def _advance(way: np.ndarray, arc: np.ndarray, at: np.ndarray, progress: float) -> float:
     """How far along the way the robot is: never back, and never more than a step ahead."""
     ahead = np.linspace(progress, min(progress + 0.1, arc[-1]), 11)
-    points = np.array([_point(way, arc, s) for s in ahead])
-    return float(ahead[np.linalg.norm(points - at, axis=1).argmin()])
+    x, y = np.interp(ahead, arc, way[:, 0]), np.interp(ahead, arc, way[:, 1])
+    return float(ahead[((x - at[0]) ** 2 + (y - at[1]) ** 2).argmin()])
 
 
 def _number(default: float) -> Any:
