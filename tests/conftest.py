@@ -22,6 +22,10 @@ def rng():
     return np.random.default_rng(20240)
 
 
+def as_float32(tree):
+    return jax.tree.map(lambda a: a.astype("float32") if a.dtype == "float64" else a, tree)
+
+
 def make_camera(focal=270.0):
     K = jnp.array([[focal, 0.0, 159.5], [0.0, focal, 119.5], [0.0, 0.0, 1.0]])
     return Camera(K, width=320, height=240)

@@ -18,8 +18,12 @@ pytestmark = pytest.mark.usefixtures("x64")
 
 
 def test_angles_worked_by_hand():
-    np.testing.assert_allclose(wrap(jnp.array([0.0, 3.5, -3.5, 7.0])), [0, 3.5 - 2 * np.pi, 2 * np.pi - 3.5, 7 - 2 * np.pi])
-    np.testing.assert_allclose(wrap_axial(jnp.array([0.0, 2.0, -2.0, 3.2])), [0, 2 - np.pi, np.pi - 2, 3.2 - np.pi])
+    np.testing.assert_allclose(
+        wrap(jnp.array([0.0, 3.5, -3.5, 7.0])), [0, 3.5 - 2 * np.pi, 2 * np.pi - 3.5, 7 - 2 * np.pi]
+    )
+    np.testing.assert_allclose(
+        wrap_axial(jnp.array([0.0, 2.0, -2.0, 3.2])), [0, 2 - np.pi, np.pi - 2, 3.2 - np.pi]
+    )
 
 
 @pytest.mark.parametrize(("function", "period"), [(wrap, 2 * np.pi), (wrap_axial, np.pi)])
@@ -39,7 +43,8 @@ def test_safe_functions_are_the_plain_ones_where_those_are_defined(rng):
     np.testing.assert_allclose(safe_arctan2(jnp.asarray(y), jnp.asarray(x)), np.arctan2(y, x))
     axes = np.array([[0, 1], [0, -1], [1, 0], [-1, 0]], float)
     np.testing.assert_allclose(
-        safe_arctan2(jnp.asarray(axes[:, 0]), jnp.asarray(axes[:, 1])), np.arctan2(axes[:, 0], axes[:, 1])
+        safe_arctan2(jnp.asarray(axes[:, 0]), jnp.asarray(axes[:, 1])),
+        np.arctan2(axes[:, 0], axes[:, 1]),
     )
 
 
@@ -54,7 +59,9 @@ def test_safe_functions_are_the_plain_ones_where_those_are_defined(rng):
         (safe_arctan2, (0.0, 0.0)),
     ],
 )
-def test_safe_functions_and_their_gradients_are_zero_where_the_plain_ones_are_not_defined(function, at):
+def test_safe_functions_and_their_gradients_are_zero_where_the_plain_ones_are_not_defined(
+    function, at
+):
     at = tuple(jnp.asarray(a) for a in at)
     numbers = range(len(at))
     assert function(*at) == 0

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 import reference
+
 from sofjax.geometry import SE2, Mount, projection_matrix
 from sofjax.geometry.camera import rotation_robot_camera
 
@@ -18,7 +18,7 @@ def project(camera, mount, point, pose=(0.0, 0.0, 0.0)):
 
 
 def test_projection_worked_by_hand(camera):
-    # 1 m over the floor and looking straight ahead: the floor 2 m ahead is 270 / 2 px below the centre
+    # 1 m up and looking straight ahead: the floor 2 m ahead is 270 / 2 px below the centre
     level = Mount.create(height=1.0)
     pixel, depth = project(camera, level, (2, 0, 0))
     np.testing.assert_allclose(pixel, [159.5, 119.5 + 135])
@@ -71,7 +71,10 @@ def test_projection_is_the_reference_and_its_third_component_the_depth(camera, m
         pose = rng.normal(size=3)
         points = rng.normal(size=(10, 3)) * 3
         T_world_robot = SE2(jnp.asarray(pose[:2]), jnp.asarray(pose[2]))
-        x = jnp.column_stack([points, np.ones(10)]) @ projection_matrix(camera, mount, T_world_robot).T
+        x = (
+            jnp.column_stack([points, np.ones(10)])
+            @ projection_matrix(camera, mount, T_world_robot).T
+        )
         pixels, depth = reference.project(camera.K, mount, pose, points)
         np.testing.assert_allclose(x[:, 2], depth, atol=1e-12)
         np.testing.assert_allclose(x[:, :2], pixels * depth[:, None], atol=1e-9)

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 import reference
+
 from sofjax.geometry import (
     SE2,
     Mount,
@@ -243,5 +243,7 @@ def test_float32_is_good_to_a_millimetre_at_five_metres(camera, mount, rng):
     points = jnp.asarray(rng.uniform([0.5, -2], [5, 2], size=(100, 2)))
     pixels, _ = jax.vmap(floor_to_image, (None, 0))(H_F, points)
     with jax.enable_x64(False):
-        back, _ = jax.vmap(image_to_floor, (None, 0))(H_F.astype("float32"), pixels.astype("float32"))
+        back, _ = jax.vmap(image_to_floor, (None, 0))(
+            H_F.astype("float32"), pixels.astype("float32")
+        )
     np.testing.assert_allclose(back, points, atol=1e-3)

@@ -1,11 +1,11 @@
-"""Lines: homogeneous and polar form, transfer, and differences that do not depend on their names."""
+"""Lines: homogeneous and polar form, transfer, and differences whatever the lines are named."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 import reference
+
 from sofjax.geometry import SE2, PolarLine, line_through, polar, polar_difference, transfer_line
 from sofjax.geometry.lines import (
     cofactor,
@@ -78,7 +78,11 @@ def test_the_scale_of_a_homogeneous_line_does_not_matter(rng):
 def test_points_that_coincide_have_no_line_and_it_is_zero():
     ends = jnp.array([[1.0, 2.0], [1.0, 2.0]])
     np.testing.assert_array_equal(line_through(*ends), 0)
-    for found in (polar(line_through(*ends)), polar_through(ends), polar(jnp.array([0.0, 0.0, 1.0]))):
+    for found in (
+        polar(line_through(*ends)),
+        polar_through(ends),
+        polar(jnp.array([0.0, 0.0, 1.0])),
+    ):
         assert (found.rho, found.theta) == (0, 0)
 
 

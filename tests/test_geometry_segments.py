@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 import reference
+
 from sofjax.geometry import SE2, Segments, overlap
 from sofjax.geometry.segments import clip
 

@@ -1,11 +1,14 @@
 """The homography that the floor induces between two images; eqs. (4) to (8)."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 import reference
+from conftest import as_float32
+
 from sofjax.geometry import SE2, Mount, floor_homography, two_view_homography
 from sofjax.geometry.two_view import transfer_segment
 
@@ -48,7 +51,7 @@ def test_no_motion_is_the_identity(camera, mounts):
 
 
 def test_two_motions_are_the_product_of_their_homographies(camera, mount, motions):
-    for A, B in zip(motions, motions[1:], strict=False):
+    for A, B in itertools.pairwise(motions):
         H, H_A, H_B = (two_view_homography(camera, mount, T) for T in (A @ B, A, B))
         np.testing.assert_allclose(H, H_B @ H_A, atol=1e-8)
 
@@ -56,7 +59,9 @@ def test_two_motions_are_the_product_of_their_homographies(camera, mount, motion
 def test_the_motion_back_is_the_inverse(camera, mounts, motions):
     for mount, T in zip(mounts, motions, strict=True):
         back = two_view_homography(camera, mount, T.inverse())
-        np.testing.assert_allclose(back @ two_view_homography(camera, mount, T), np.eye(3), atol=1e-8)
+        np.testing.assert_allclose(
+            back @ two_view_homography(camera, mount, T), np.eye(3), atol=1e-8
+        )
 
 
 def test_only_the_ratio_of_lengths_to_the_height_matters(camera, motions):
@@ -65,7 +70,9 @@ def test_only_the_ratio_of_lengths_to_the_height_matters(camera, motions):
     for T in motions:
         double = SE2(2 * T.xy, T.yaw)
         np.testing.assert_allclose(
-            two_view_homography(camera, large, double), two_view_homography(camera, small, T), atol=1e-9
+            two_view_homography(camera, large, double),
+            two_view_homography(camera, small, T),
+            atol=1e-9,
         )
 
 
@@ -140,8 +147,7 @@ def test_float32_transfers_to_a_tenth_of_a_pixel(camera, mount, rng):
     ends = jnp.asarray(rng.uniform([0, 80], [320, 240], size=(100, 2, 2)))
     exact, some = jax.vmap(transfer_segment, (None, 0))(two_view_homography(camera, mount, T), ends)
     with jax.enable_x64(False):
-        narrow = lambda tree: jax.tree.map(lambda a: a.astype("float32"), tree)
-        H = two_view_homography(narrow(camera), narrow(mount), narrow(T))
-        found, _ = jax.vmap(transfer_segment, (None, 0))(H, narrow(ends))
+        H = two_view_homography(as_float32(camera), as_float32(mount), as_float32(T))
+        found, _ = jax.vmap(transfer_segment, (None, 0))(H, as_float32(ends))
     assert some.all()
     np.testing.assert_allclose(found, exact, atol=0.1)
