@@ -449,8 +449,8 @@ def test_lsd_errs_on_drawn_images_as_on_the_sample_drive():
 
 CAMERA = Camera(jnp.array([[291.0, 0.0, 159.5], [0.0, 291.0, 119.5], [0.0, 0.0, 1.0]]), 320, 240)
 EXACT = Detection(
-    noise=0.0, shortening=0.0, missed=0.0, full_contrast=1e-6, broken=0.0, false_segments=0.0,
-    shortest=3.0, max_depth=8.0,
+    noise=0.0, shortening=0.0, missed=0.0, full_contrast=1e-6, fading=1.0, apart=0.0, broken=0.0,
+    false_segments=0.0, shortest=3.0, max_depth=8.0,
 )  # fmt: skip
 
 
@@ -574,6 +574,25 @@ def test_misses_and_inventions_are_as_many_as_asked():
     assert count(missed=0.5) == pytest.approx(all_of_them / 2, rel=0.1)
     assert count(false_segments=3.0) - all_of_them == pytest.approx(3, abs=0.6)
     assert count(broken=1.0) > 1.5 * all_of_them
+
+
+def test_a_narrow_line_comes_as_its_two_edges():
+    world, mounts = world_of("l", 2), forty_drives()[0]
+    scene = scene_of("l", 2)
+    scene = dataclasses.replace(scene, contrast=jnp.where(scene.narrow, scene.contrast, 0))
+    pose = SE2(jnp.tile(jnp.array([0.0, 3.0]), (FRAMES, 1)), jnp.full(FRAMES, 1.5))
+    mounts = jax.tree.map(lambda leaf: leaf[0], mounts)
+    detection = dataclasses.replace(EXACT, apart=3.0)
+    observed = look(scene, CAMERA, mounts, pose, pose, jax.random.key(0), detection)
+    ends = np.asarray(observed.segments_image.endpoints[0])[
+        np.asarray(observed.segments_image.valid[0])
+    ]
+    assert "grout" in world.floor_segments.kinds and len(ends) > 6
+    for segment in ends:
+        d = segment[1] - segment[0]
+        normal = np.array([-d[1], d[0]]) / np.linalg.norm(d)
+        offsets = np.abs((ends - segment[0]) @ normal)
+        assert np.isclose(offsets, 3.0, atol=0.05).all(1).any()
 
 
 def test_scratch_memory_does_not_grow_with_the_images():

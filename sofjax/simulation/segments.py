@@ -16,7 +16,7 @@ from sofjax.geometry.camera import Camera, Mount, projection_matrix
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 from sofjax.observation import Observation
-from sofjax.simulation.worlds import World
+from sofjax.simulation.worlds import NARROW, World
 
 NEAREST_DEPTH = 0.1  # metres before the camera
 WALL_DEPTH = 0.05  # metres behind a wall's face that it does not hide: what is fixed to it
@@ -31,6 +31,7 @@ class Scene(eqx.Module):
     edges_world: Float[Array, "*batch edges 2 3"]  # metres; floor, raised and mirrored edges
     contrast: Float[Array, "*batch edges"]  # step of brightness, 0 to 1; padding has 0
     on_floor: Bool[Array, "*batch edges"]
+    narrow: Bool[Array, "*batch edges"]  # a line of some millimetres, seen as two edges
     walls_world: Float[Array, "*batch walls 2 2"]  # metres; padding has no length
 
     @staticmethod
@@ -43,12 +44,14 @@ class Scene(eqx.Module):
         endpoints = np.concatenate([kind.endpoints for kind in kinds])
         contrast = np.concatenate([kind.contrast for kind in kinds])
         on_floor = np.arange(len(contrast)) < len(kinds[0].contrast)
+        narrow = np.array([kind in NARROW for parts in kinds for kind in parts.kinds])
         edges = edges or -(-len(contrast) // 64) * 64
         walls = walls or -(-len(world.walls) // 8) * 8
         return Scene(
             jnp.asarray(_pad(endpoints, edges, "edges"), float),
             jnp.asarray(_pad(contrast, edges, "edges"), float),
             jnp.asarray(_pad(on_floor, edges, "edges")),
+            jnp.asarray(_pad(narrow, edges, "edges")),
             jnp.asarray(_pad(world.walls, walls, "walls"), float),
         )
 
@@ -64,9 +67,11 @@ class Detection(eqx.Module):
 
     noise: float = 0.25  # pixels, standard deviation of an end across the line
     shortening: float = 1.5  # pixels that an end is short of the edge's, mean size
-    missed: float = 0.15  # share of edges of good contrast that are not seen
+    missed: float = 0.1  # share of edges of good contrast that are not seen
     full_contrast: float = 0.1  # step of brightness from which an edge's contrast is good
-    broken: float = 0.2  # share of edges that come in two pieces
+    fading: float = 0.3  # share of a narrow line's contrast that the blur leaves
+    apart: float = 2.4  # pixels between the two edges that are seen of a narrow line
+    broken: float = 0.25  # share of edges that come in two pieces
     false_segments: float = 2.0  # mean number an image
     shortest: float = 15.0  # pixels
     max_depth: float = 10.0  # metres
@@ -132,12 +137,17 @@ def see(
 
     # As a detector reports them
     miss_key, break_key, false_key, noise_key = jax.random.split(key, 4)
-    clear = jnp.minimum(scene.contrast[chosen] / detection.full_contrast, 1)
+    narrow = scene.narrow[chosen]
+    contrast = scene.contrast[chosen] * jnp.where(narrow, detection.fading, 1)
+    clear = jnp.minimum(contrast / detection.full_contrast, 1)
     detected = jax.random.uniform(miss_key, clear.shape) < clear * (1 - detection.missed)
     detected &= part[:, 1] > part[:, 0]
     pieces, whole = jax.vmap(break_up, in_axes=(0, 0, None))(
         segments, jax.random.uniform(break_key, (candidates, 3)), detection.broken
     )
+    doubled = jax.vmap(both_edges, in_axes=(0, None))(segments, detection.apart)
+    pieces = jnp.where(narrow[:, None, None, None], doubled, pieces)
+    whole |= narrow[:, None]
     invented, there = invent(camera, detection, false_key)
     endpoints = jnp.concatenate([pieces.reshape(-1, 2, 2), invented])
     valid = jnp.concatenate([(detected[:, None] & whole).reshape(-1), there])
@@ -241,6 +251,20 @@ def break_up(
     return jnp.stack([first, jnp.stack([inner[1], segment[1]])]), jnp.stack([breaks | True, breaks])
 
 
+def both_edges(
+    segment: Float[Array, "2 2"], apart: Float[Array, ""] | float
+) -> Float[Array, "2 2 2"]:
+    """The two edges of a narrow line, beside its middle in the image."""
+    shift = apart / 2 * _normal(segment)
+    return jnp.stack([segment + shift[None], segment - shift[None]])
+
+
+def _normal(segment: Float[Array, "2 2"]) -> Float[Array, "2"]:
+    """The unit vector across a segment; zero if it has no length."""
+    d = segment[1] - segment[0]
+    return safe_divide(jnp.stack([-d[1], d[0]]), jnp.broadcast_to(safe_norm(d), (2,)))
+
+
 def invent(
     camera: Camera, detection: Detection, key: PRNGKeyArray
 ) -> tuple[Float[Array, "false 2 2"], Bool[Array, "false"]]:
@@ -261,8 +285,7 @@ def disturb(
 ) -> Float[Array, "2 2"]:
     """Noise across the line at both ends, and each end drawn in along it; by normal draws."""
     across, along = draws
-    d = segment[1] - segment[0]
-    unit = safe_divide(d, jnp.broadcast_to(safe_norm(d), (2,)))
-    normal = jnp.stack([-unit[1], unit[0]])
+    normal = _normal(segment)
+    unit = jnp.stack([normal[1], -normal[0]])
     short = jnp.abs(along) * jnp.array([1.0, -1.0]) * detection.shortening
     return segment + detection.noise * across[:, None] * normal[None] + short[:, None] * unit[None]

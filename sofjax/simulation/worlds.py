@@ -157,6 +157,9 @@ OUTLINE = {
 }
 
 
+NARROW = ("grout", "plank", "joint")  # kinds of lines whose truth is their middle
+
+
 class _Found:
     """Edges as they are collected."""
 
