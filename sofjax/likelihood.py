@@ -14,11 +14,11 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, segment_to_floor
 from sofjax.geometry.lines import PolarLine, polar_difference, polar_through
 from sofjax.geometry.se2 import SE2
-from sofjax.geometry.segments import Segments, overlap
+from sofjax.geometry.segments import Segments
 
 
 class SensorModel(eqx.Module):
-    """Gaussian noise of an observed segment in (rho, theta), and the cost of one that fits nothing."""
+    """Gaussian noise of a segment in (rho, theta), and the cost of one that fits nothing."""
 
     propagate: bool = eqx.field(static=True, default=True)  # or the paper's constant sigmas
     pixel_sigma: float = 0.5  # pixels, of an end point across its segment
@@ -88,7 +88,8 @@ def sight(
         constant = jnp.array([sensor.rho_sigma, sensor.theta_sigma]) ** 2
         covariance = jnp.broadcast_to(jnp.diag(constant), covariance.shape)
         tilt = jnp.zeros_like(tilt)
-    some = some & (covariance[:, 1, 1] < sensor.theta_limit**2)
+    has_length = (segments_image.endpoints[:, 0] != segments_image.endpoints[:, 1]).any(axis=-1)
+    some = some & has_length & (covariance[:, 1, 1] < sensor.theta_limit**2)
     # what is reported at the nominal tilt moves against the correction
     return Sightings(endpoints, some & segments_image.valid, line, covariance, -tilt)
 
@@ -174,7 +175,11 @@ def compare(
     information = jnp.sum(jnp.where(weight, JW @ sightings.tilt, 0), axis=0)
     gradient = jnp.sum((JW @ d[..., None])[..., 0], axis=0)
     variance = sensor.tilt_sigma**2  # (I + variance A)^-1 variance b: right for variance = 0 too
-    a, b, c = 1 + variance * information[0, 0], variance * information[0, 1], 1 + variance * information[1, 1]
+    a, b, c = (
+        1 + variance * information[0, 0],
+        variance * information[0, 1],
+        1 + variance * information[1, 1],
+    )
     g = variance * gradient
     tilt = jnp.stack([c * g[0] - b * g[1], a * g[1] - b * g[0]]) / (a * c - b * b)
 

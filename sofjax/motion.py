@@ -1,4 +1,4 @@
-"""Motion model: Gaussian about the odometer's reading, whose systematic errors are learned; III.A."""
+"""Motion model: Gaussian about the odometer's reading, whose systematic errors it learns; III.A."""
 
 import equinox as eqx
 import jax
@@ -67,7 +67,9 @@ def sample_motion(
     distance = jnp.abs(forward)
     left, right = jnp.maximum(turn, 0), jnp.minimum(turn, 0)
     zero = jnp.zeros_like(distance)
-    A = jnp.stack([jnp.stack([forward, zero, zero, zero]), jnp.stack([zero, left, right, distance])])
+    A = jnp.stack(
+        [jnp.stack([forward, zero, zero, zero]), jnp.stack([zero, left, right, distance])]
+    )
     variance_distance = model.distance_noise**2 * distance
     variance_turn = model.heading_noise**2 * distance + model.turn_noise**2 * (left - right)
     noise = jnp.diag(jnp.stack([variance_distance, variance_turn]))

@@ -23,7 +23,12 @@ PAPER = SlamConfig(
     ),
     sensor=SensorModel(propagate=False, rho_sigma=0.05, theta_sigma=0.035, tilt_sigma=0.0),
     segment_map=MapRules(
-        rule="gamma", classify=False, rho_drift=0.0, theta_drift=0.0, merge_distance=0.05, min_share=0.0
+        rule="gamma",
+        classify=False,
+        rho_drift=0.0,
+        theta_drift=0.0,
+        merge_distance=0.05,
+        min_share=0.0,
     ),
     filter=FilterRules(choice="winner", gate_each=True),
 )

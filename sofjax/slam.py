@@ -14,7 +14,15 @@ from sofjax.likelihood import SensorModel, adapt_noise, compare, sight
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions
 from sofjax.observation import Observation
 from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
-from sofjax.segment_map import MapRules, SegmentMap, empty_map, in_view, integrate, is_raised, propose
+from sofjax.segment_map import (
+    MapRules,
+    SegmentMap,
+    empty_map,
+    in_view,
+    integrate,
+    is_raised,
+    propose,
+)
 from sofjax.sof import extract
 
 LOST_AFTER = 10  # images without one known segment
@@ -26,7 +34,9 @@ class FilterRules(eqx.Module):
     particles: int = eqx.field(static=True, default=1000)  # N
     choice: str = eqx.field(static=True, default="resample")  # or "winner", the paper's
     effective_share: float = 0.5  # resample below this share of N
-    gate_each: bool = eqx.field(static=True, default=False)  # Fig. 6, step 4: SoF for every particle
+    gate_each: bool = eqx.field(
+        static=True, default=False
+    )  # Fig. 6, step 4: SoF for every particle
     max_depth: float = 8.0  # metres: farther segments are not used
 
 
@@ -107,7 +117,6 @@ def step(
     rules, sensor = config.segment_map, config.sensor
     N = config.filter.particles
     key, key_motion, key_choice = jax.random.split(state.key, 3)
-    before = mean_pose(state.particles)
 
     # 1-3) move, and sample N particles by the motion model
     motion, bias = sample_motions(
@@ -182,7 +191,8 @@ def step(
         map_overflow=overflow,
         lost=unmatched >= LOST_AFTER,
         segment_class=sum(
-            stage.astype(int) for stage in (detected, sightings.valid, sightings.valid & (known | new))
+            stage.astype(int)
+            for stage in (detected, sightings.valid, sightings.valid & (known | new))
         ),
     )
     return SlamState(particles, segment_map, recent, reference, noise, unmatched, key), info
@@ -235,7 +245,9 @@ class FinalMap(eqx.Module):
 def final_map(config: SlamConfig, mount: Mount, segment_map: SegmentMap) -> FinalMap:
     """The segments seen often enough that do not stand above the floor."""
     rules = config.segment_map
-    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, segment_map.line, segment_map.covariance)
+    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(
+        rules, segment_map.line, segment_map.covariance
+    )
     often = segment_map.updates >= rules.min_updates
     kappa, sigma = segment_map.line[:, 2], safe_sqrt(segment_map.covariance[:, 2, 2])
     known = ~jnp.asarray(rules.classify) | (sigma < rules.kappa_known)

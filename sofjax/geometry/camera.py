@@ -8,7 +8,7 @@ from sofjax.geometry.se2 import SE2
 
 
 class Camera(eqx.Module):
-    """Intrinsics of a pinhole camera without distortion: images are undistorted by the front end."""
+    """Intrinsics of a pinhole camera without distortion: the front end undistorts the images."""
 
     K: Float[Array, "3 3"]  # calibration matrix, pixels
     width: int = eqx.field(static=True)  # pixels
@@ -49,14 +49,12 @@ class Mount(eqx.Module):
 
 
 def rotation_robot_camera(mount: Mount) -> Float[Array, "3 3"]:
-    """R_robot_camera = Rz(yaw) Ry(pitch) Rx(roll) A, with A the optical axes in those of the robot."""
+    """R_robot_camera = Rz(yaw) Ry(pitch) Rx(roll) A, with A the optical axes in the robot's."""
     A = jnp.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     return rotation_z(mount.yaw) @ rotation_y(mount.pitch) @ rotation_x(mount.roll) @ A
 
 
-def projection_matrix(
-    camera: Camera, mount: Mount, T_world_robot: SE2
-) -> Float[Array, "3 4"]:
+def projection_matrix(camera: Camera, mount: Mount, T_world_robot: SE2) -> Float[Array, "3 4"]:
     """P = K R [I | -C], from world points (X, Y, Z, 1) to image points (x, y, 1); eqs. (1) and (2).
 
     **Arguments:**

@@ -8,9 +8,7 @@ from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import clip
 
 
-def floor_homography(
-    camera: Camera, mount: Mount, T_world_robot: SE2
-) -> Float[Array, "3 3"]:
+def floor_homography(camera: Camera, mount: Mount, T_world_robot: SE2) -> Float[Array, "3 3"]:
     """H_F = [p1 p2 p4], from the floor (X, Y, 1) to the image (x, y, 1); eqs. (10) and (11).
 
     **Arguments:**
@@ -69,16 +67,12 @@ def segment_to_floor(
     return X[:, :2] / jnp.where(some, X[:, 2:], 1), some
 
 
-def line_to_floor(
-    H_F: Float[Array, "3 3"], line_image: Float[Array, "3"]
-) -> Float[Array, "3"]:
+def line_to_floor(H_F: Float[Array, "3 3"], line_image: Float[Array, "3"]) -> Float[Array, "3"]:
     """L = H_F^T l, the floor line that an image line comes from; eq. (13)."""
     return H_F.T @ line_image
 
 
-def line_to_image(
-    H_F: Float[Array, "3 3"], line_floor: Float[Array, "3"]
-) -> Float[Array, "3"]:
+def line_to_image(H_F: Float[Array, "3 3"], line_floor: Float[Array, "3"]) -> Float[Array, "3"]:
     """l = H_F^-T L, the inverse of eq. (13)."""
     return jnp.linalg.solve(H_F.T, line_floor)
 

@@ -1,4 +1,4 @@
-"""Lines of a plane: homogeneous and polar form, transfer by a homography; section II.A and eq. (9)."""
+"""Lines of a plane: homogeneous and polar form, transfer by a homography; II.A and eq. (9)."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,9 +18,7 @@ class PolarLine(eqx.Module):
     theta: Float[Array, "*batch"]  # angle of the line to the first axis, radians
 
 
-def line_through(
-    x1: Float[Array, "2"], x2: Float[Array, "2"]
-) -> Float[Array, "3"]:
+def line_through(x1: Float[Array, "2"], x2: Float[Array, "2"]) -> Float[Array, "3"]:
     """l = x1 × x2, the homogeneous line through two points; zero if the points coincide."""
     return jnp.cross(jnp.append(x1, 1.0), jnp.append(x2, 1.0))
 

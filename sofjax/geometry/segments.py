@@ -9,7 +9,7 @@ from sofjax.geometry.se2 import SE2
 
 
 class Segments(eqx.Module):
-    """Segments of one frame, named by the variable: `_image` in pixels, `_robot`, `_world` in metres.
+    """Segments of one frame, named by the variable: `_image` in pixels, `_world` in metres.
 
     Where `valid` is false the end points are padding: finite, and without meaning.
     """

@@ -8,9 +8,7 @@ from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import clip
 
 
-def two_view_homography(
-    camera: Camera, mount: Mount, T_first_second: SE2
-) -> Float[Array, "3 3"]:
+def two_view_homography(camera: Camera, mount: Mount, T_first_second: SE2) -> Float[Array, "3 3"]:
     """H with x' ~ H x for the floor seen before and after a motion of the robot; eqs. (7) and (8).
 
     Differs from the paper: eq. (8) has the floor's normal along the camera's optical axis, as if
@@ -19,7 +17,7 @@ def two_view_homography(
     H = K R0 (R̄ - t̄ nᵀ/h) R0ᵀ K^-1, equal to H_F' H_F^-1 up to scale.
 
     **Arguments:**
-    - `camera`, `mount`: pixels; metres and radians. Only the ratio of the motion to `height` matters.
+    - `camera`, `mount`: pixels; metres and radians. Only motion over `height` matters.
     - `T_first_second`: the robot's motion, metres and radians.
 
     **Returns:** H in pixels.

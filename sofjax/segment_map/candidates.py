@@ -1,0 +1,62 @@
+"""Which map lines each observed segment may be; step 5 of Fig. 6, before the particles are."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sofjax.geometry.lines import PolarLine, polar_difference
+from sofjax.geometry.matrices import inverse_2x2
+from sofjax.geometry.se2 import SE2
+from sofjax.geometry.segments import overlap
+from sofjax.likelihood import Candidates, SensorModel, Sightings, mahalanobis
+from sofjax.segment_map.lines import MapRules, SegmentMap, appear, believed
+
+
+def propose(
+    rules: MapRules,
+    sensor: SensorModel,
+    segment_map: SegmentMap,
+    sightings: Sightings,
+    T_world_foot: SE2,
+) -> tuple[Candidates, Int[Array, "M C"], Float[Array, "M"]]:
+    """The C map lines most like each sighting, as they should appear from the predicted foot.
+
+    **Returns:** the candidates; their slots in the map; and for each sighting the smallest error
+    of all map lines, overlapping or not by up to `join_gap`.
+    """
+    line, covariance = jax.vmap(believed, in_axes=(None, 0, 0))(
+        rules, segment_map.line, segment_map.covariance
+    )
+    seen, H = jax.vmap(appear, in_axes=(0, 0, None))(line, segment_map.anchor, T_world_foot)
+    lines = PolarLine(seen[:, 0], seen[:, 1])
+    spread = H @ covariance @ jnp.swapaxes(H, 1, 2)
+    if not sensor.propagate:
+        spread = jnp.zeros_like(spread)
+    drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
+    tilting = sensor.tilt_sigma**2 * sightings.tilt @ jnp.swapaxes(sightings.tilt, 1, 2)
+
+    S = sightings.covariance[:, None] + spread + drift
+    S_tilt = S + tilting[:, None]
+    W_tilt = inverse_2x2(S_tilt)
+    observed = PolarLine(sightings.line.rho[:, None], sightings.line.theta[:, None])
+    difference = polar_difference(observed, lines)
+    error = mahalanobis(difference, W_tilt)
+
+    # apparent extents: a raised line is seen magnified about the foot
+    extent = (
+        T_world_foot.inverse().apply(segment_map.segments_world.endpoints) * seen[:, 2, None, None]
+    )
+    share = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))(
+        extent, sightings.endpoints_foot
+    )
+    error = jnp.where(segment_map.valid & (share > -rules.join_gap), error, jnp.inf)
+    best, slot = jax.lax.top_k(-error, rules.candidates)
+    rows = jnp.arange(error.shape[0])[:, None]
+    candidates = Candidates(
+        line=PolarLine(lines.rho[slot], lines.theta[slot]),
+        kappa=seen[slot, 2],
+        precision=inverse_2x2(S[rows, slot]),
+        precision_tilt=W_tilt[rows, slot],
+        valid=jnp.isfinite(best),
+    )
+    return candidates, slot, -best[:, 0]

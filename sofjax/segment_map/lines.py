@@ -1,0 +1,121 @@
+"""The map's lines: what is kept of each, whether it lies on the floor, and how it should appear."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sofjax.geometry.angles import safe_sqrt
+from sofjax.geometry.camera import Camera, Mount
+from sofjax.geometry.floor import floor_homography, floor_to_image
+from sofjax.geometry.lines import PolarLine, direction, normal
+from sofjax.geometry.se2 import SE2
+from sofjax.geometry.segments import Segments
+
+
+class MapRules(eqx.Module):
+    """How the map grows; the paper's R and L, and what goes past it."""
+
+    rule: str = eqx.field(static=True, default="kalman")  # or "gamma", eq. (14)
+    classify: bool = eqx.field(static=True, default=True)  # estimate kappa, tell floor from above
+    capacity: int = eqx.field(static=True, default=512)  # K
+    candidates: int = eqx.field(static=True, default=4)  # C, map lines compared per sighting
+    range: float = 5.0  # R, metres: what is farther does not extend a segment
+    length: float = 10.0  # L = 2 R, metres: a longer segment rests
+    rest: int = 10  # steps
+    merge_distance: float = 0.01  # metres between doubled lines
+    merge_angle: float = 0.035  # radians
+    join_gap: float = 0.3  # metres between two pieces of one line
+    kappa_sigma: float = 0.3  # prior of a line that does not lie on the floor
+    kappa_above: float = 1.04  # a magnification between these two is taken for floor: nothing ...
+    kappa_below: float = 0.7  # ... lies little under a floor, and reflections lie deep
+    kappa_gate: float = 3.0  # standard deviations from 1 that tell a line from the floor
+    kappa_known: float = 0.07  # standard deviation below which a line may be one of the final map
+    rho_drift: float = 0.002  # metres: no map line is known better than ...
+    theta_drift: float = 0.002  # ... this, radians
+    forget: int = 50  # steps unseen after which a line of few sightings is dropped
+    min_updates: int = 5  # sightings that make a line one of the final map, ...
+    min_share: float = 0.25  # ... and their share of the images in which it should have been seen
+
+
+class SegmentMap(eqx.Module):
+    """K slots for map segments."""
+
+    segments_world: Segments  # [K], metres
+    anchor: SE2  # [K] T_world_foot of the first sighting
+    line: Float[Array, "K 3"]  # (rho, theta, kappa) in the anchor
+    covariance: Float[Array, "K 3 3"]
+    updates: Int[Array, "K"]  # delta of eq. (14)
+    resting: Int[Array, "K"]  # steps left
+    unseen: Int[Array, "K"]  # steps since the last sighting
+    expected: Int[Array, "K"]  # images in which its middle was in view
+
+    @property
+    def valid(self) -> Bool[Array, "K"]:
+        return self.segments_world.valid
+
+
+def empty_map(rules: MapRules) -> SegmentMap:
+    K = rules.capacity
+    return SegmentMap(
+        segments_world=Segments(jnp.zeros((K, 2, 2)), jnp.zeros(K, bool)),
+        anchor=SE2(jnp.zeros((K, 2)), jnp.zeros(K)),
+        line=jnp.zeros((K, 3)).at[:, 2].set(1),
+        covariance=jnp.broadcast_to(jnp.eye(3), (K, 3, 3)),
+        updates=jnp.zeros(K, int),
+        resting=jnp.zeros(K, int),
+        unseen=jnp.zeros(K, int),
+        expected=jnp.zeros(K, int),
+    )
+
+
+def is_raised(
+    rules: MapRules, line: Float[Array, "3"], covariance: Float[Array, "3 3"]
+) -> Bool[Array, ""]:
+    """Whether all views of a line together say that it does not lie on the floor."""
+    kappa, sigma = line[2], safe_sqrt(covariance[2, 2])
+    outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
+    return rules.classify & outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
+
+
+def believed(
+    rules: MapRules, line: Float[Array, "3"], covariance: Float[Array, "3 3"]
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """A line's estimate given its class: of a floor line, conditioned on kappa = 1."""
+    gain = covariance[:, 2] / covariance[2, 2]
+    on_floor = (line + gain * (1 - line[2])).at[2].set(1)
+    certain = covariance - jnp.outer(gain, covariance[2])
+    raised = is_raised(rules, line, covariance)
+    return jnp.where(raised, line, on_floor), jnp.where(raised, covariance, certain)
+
+
+def appear(
+    line: Float[Array, "3"], anchor: SE2, T_world_foot: SE2
+) -> tuple[Float[Array, "3"], Float[Array, "2 3"]]:
+    """How a map line should appear from a foot.
+
+    **Returns:** (rho, theta, kappa) about that foot, and d(rho, theta) / d(line).
+    """
+    T_anchor_foot = anchor.between(T_world_foot)
+    polar = PolarLine(line[0], line[1])
+    n, d = normal(polar), direction(polar)
+    along, across = d @ T_anchor_foot.xy, n @ T_anchor_foot.xy
+    rho = line[0] - line[2] * across
+    zero, one = jnp.zeros_like(rho), jnp.ones_like(rho)
+    H = jnp.stack([jnp.stack([one, line[2] * along, -across]), jnp.stack([zero, one, zero])])
+    return jnp.stack([rho, line[1] - T_anchor_foot.yaw, line[2]]), H
+
+
+def in_view(
+    rules: MapRules, camera: Camera, mount: Mount, segment_map: SegmentMap, T_world_robot: SE2
+) -> Bool[Array, "K"]:
+    """Which map lines have their middle in the image and within R; walls do not hide them."""
+    H_F = floor_homography(camera, mount, T_world_robot)
+    foot = T_world_robot.apply(mount.T_robot_foot.xy)
+    middle = segment_map.segments_world.endpoints.mean(axis=1) - foot
+    apparent = foot + middle * segment_map.line[:, 2:]
+    x, ahead = jax.vmap(floor_to_image, in_axes=(None, 0))(H_F, apparent)
+    inside = (x >= 0).all(axis=1) & (x < jnp.array([camera.width, camera.height], float)).all(
+        axis=1
+    )
+    return segment_map.valid & ahead & inside & (jnp.sum(middle**2, axis=1) < rules.range**2)
