@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import re
 import time
 from functools import cache
 
@@ -724,3 +725,18 @@ def test_increments_of_a_path_begin_with_none():
         zip(ride_of("l").truth.yaw[1:], ride_of("l").truth.yaw, strict=False), 5
     )
     np.testing.assert_allclose([a - b for a, b in pairs], steps.yaw[1:6], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_demo_ends_with_a_page(tmp_path, capsys):
+    folder = tmp_path / "demo"
+    assert main(["demo", "--world", "l", "--out", str(folder)]) == 0
+    page = (folder / "index.html").read_text()
+    for source in re.findall(r'src="([^"]+)"', page):
+        assert (folder / source).stat().st_size > 1000
+    assert "odometer alone" in page and "[3/3]" in capsys.readouterr().out
+
+
+def test_the_demo_refuses_an_unknown_world(tmp_path, capsys):
+    assert main(["demo", "--world", "maze", "--out", str(tmp_path / "demo")]) == 2
+    assert "there is no world 'maze'" in capsys.readouterr().err
