@@ -63,8 +63,9 @@ def _measure(rules, sensor, m, sightings, slot, tilt, T_world_foot) -> _Measurem
     by_line = lambda a: jax.ops.segment_sum(a, slot, K + 1)[:K]
     expected, H = jax.vmap(appear, in_axes=(0, 0, None))(m.line, m.anchor, T_world_foot)
     at = jnp.minimum(slot, K - 1)
-    innovation = polar_difference(
-        sightings.under_tilt(tilt), PolarLine(expected[at, 0], expected[at, 1])
+    # by the map line's name: a sighting may be named from the other side
+    innovation = -polar_difference(
+        PolarLine(expected[at, 0], expected[at, 1]), sightings.under_tilt(tilt)
     )
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
     wobble = sensor.tilt_sigma**2 * sightings.tilt @ jnp.swapaxes(sightings.tilt, 1, 2)
