@@ -23,8 +23,8 @@ def test_the_first_two_shell_lines_set_everything_up():
     """`.ci/run` executes the first block line by line, and so can nobody forget one of them."""
     run, test = blocks("sh")[0].splitlines()
     assert "pip install" in run and "sofjax run examples/office" in run
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert re.search(r"\.\[(\w+)\]", run)[1] in extras
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert re.search(r"\.\[(\w+)\]", run)[1] in project["optional-dependencies"]
     assert "'.[tests]'" in test and test.endswith("-m pytest -n 2")
 
 
