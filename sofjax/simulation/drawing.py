@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,10 +83,8 @@ class Artist:
         - `stamp`: seconds; `turn_rate`: radians per second, for the blur.
         """
         faces, tops = _in_view(self._atlas, R_world_camera, C)
-        scene = _scene(self._world, self._atlas, C)
-        columns, rows, gleam = cast(
-            self._rays, jnp.asarray(R_world_camera, jnp.float32), scene, faces, tops
-        )
+        frame = _frame(self._world, self._atlas, R_world_camera, C)
+        columns, rows, gleam = cast(self._rays, frame, faces, tops)
         height, width = self._camera.height, self._camera.width
         shape = (len(RAYS) * height, width)
         colours = cv2.remap(
@@ -225,20 +224,33 @@ def _padded(rows: np.ndarray, multiple: int) -> Array:
     return jnp.asarray(np.pad(rows, ((0, short), (0, 0))), jnp.float32)
 
 
-def _scene(world: World, atlas: Atlas, C: np.ndarray) -> Float[Array, "17"]:
-    """The numbers of a frame that all rays share."""
-    low = world.corridors[:, :2].min(0)
-    numbers = [*C, world.ceiling, atlas.texels, world.look.gloss, *low]
-    for picture in (atlas.floor, atlas.far_floor, atlas.ceiling):
-        numbers += [*picture.origin, picture.texels]
-    return jnp.asarray(numbers, jnp.float32)
+class Frame(eqx.Module):
+    """What all rays of a frame share; a picture is its column, row and texels a metre."""
+
+    R_world_camera: Float32[Array, "3 3"]
+    C: Float32[Array, "3"]  # metres
+    ceiling: Float32[Array, ""]  # metres
+    gloss: Float32[Array, ""]
+    corner: Float32[Array, "2"]  # lower left of the plan, metres
+    texels: Float32[Array, ""]  # per metre, of faces and tops
+    floor: Float32[Array, "3"]
+    far_floor: Float32[Array, "3"]
+    over: Float32[Array, "3"]
+
+
+def _frame(world: World, atlas: Atlas, R_world_camera: np.ndarray, C: np.ndarray) -> Frame:
+    corner = world.corridors[:, :2].min(0)
+    pictures = [
+        np.append(p.origin, p.texels) for p in (atlas.floor, atlas.far_floor, atlas.ceiling)
+    ]
+    shared = (R_world_camera, C, world.ceiling, world.look.gloss, corner, atlas.texels, *pictures)
+    return Frame(*(jnp.asarray(value, jnp.float32) for value in shared))
 
 
 @jax.jit
 def cast(
     rays: Float32[Array, "3 rays"],
-    R_world_camera: Float32[Array, "3 3"],
-    scene: Float32[Array, "numbers"],
+    frame: Frame,
     faces: Float32[Array, "faces 10"],
     tops: Float32[Array, "tops 7"],
 ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
@@ -250,8 +262,8 @@ def cast(
     **Returns:** columns and rows of the atlas [rays]; and for the first ray of every pixel the
     columns and rows [SPREAD, pixels] of the lamps that it sees mirrored, and how strongly.
     """
-    x, y, height, ceiling, texels, gloss, low_x, low_y = scene[:8]
-    dx, dy, dz = R_world_camera @ rays
+    x, y, height = frame.C
+    dx, dy, dz = frame.R_world_camera @ rays
     nearest = jnp.zeros_like(dx)  # nearness of the nearest face
     along = jnp.zeros_like(dx)  # nearness × metres along the face
     column0, row0 = jnp.zeros_like(dx), jnp.zeros_like(dx)
@@ -274,36 +286,30 @@ def cast(
         column0, row0 = jnp.where(closer, column, column0), jnp.where(closer, row, row0)
         is_top = is_top | closer
 
-    floor, above = -dz / height, dz / (ceiling - height)
+    floor, above = -dz / height, dz / (frame.ceiling - height)
     level = jnp.maximum(floor, above)
     on_face = nearest >= level
     distance = 1 / jnp.maximum(jnp.where(on_face, nearest, level), 1e-4)
-    floor_column, floor_row, floor_texels = scene[8:11]
-    far_column, far_row, far_texels = scene[11:14]
-    ceiling_column, ceiling_row, ceiling_texels = scene[14:17]
-    is_floor, is_near = dz < 0, distance < NEAR_FLOOR
-
-    def level_picture(near: Array, far: Array, over: Array) -> Array:
-        return jnp.where(is_floor, jnp.where(is_near, near, far), over)
-
+    column, row, scale = (
+        jnp.where(dz < 0, jnp.where(distance < NEAR_FLOOR, near, far), over)
+        for near, far, over in zip(frame.floor, frame.far_floor, frame.over, strict=True)
+    )
     px, py, pz = x + distance * dx, y + distance * dy, height + distance * dz
-    scale = level_picture(floor_texels, far_texels, ceiling_texels)
-    level_columns = level_picture(floor_column, far_column, ceiling_column) + scale * px
-    level_rows = level_picture(floor_row, far_row, ceiling_row) + scale * py
-    face_columns = column0 + texels * jnp.where(is_top, px, along * distance)
-    face_rows = row0 + texels * jnp.where(is_top, py, pz)
-    columns = jnp.where(on_face, face_columns, level_columns)
-    rows = jnp.where(on_face, face_rows, level_rows)
+    face_columns = column0 + frame.texels * jnp.where(is_top, px, along * distance)
+    face_rows = row0 + frame.texels * jnp.where(is_top, py, pz)
+    columns = jnp.where(on_face, face_columns, column + scale * px)
+    rows = jnp.where(on_face, face_rows, row + scale * py)
 
     first = rays.shape[1] // len(RAYS)
     dx, dy, dz, nearest, floor = (v[:first] for v in (dx, dy, dz, nearest, floor))
-    reach = (1 + ceiling / height) / jnp.maximum(floor, 1e-4)  # to the mirrored ceiling
+    reach = (1 + frame.ceiling / height) / jnp.maximum(floor, 1e-4)  # to the mirrored ceiling
     grazing = 1 + dz / jnp.sqrt(dx * dx + dy * dy + dz * dz)
     mirrors = (floor > nearest) & (nearest * reach < 1)
-    strength = jnp.where(mirrors, gloss * (0.1 + 0.9 * grazing**3), 0)
+    strength = jnp.where(mirrors, frame.gloss * (0.1 + 0.9 * grazing**3), 0)
     spread = [reach * share for share in SPREAD]
-    mirror_columns = jnp.stack([(x + r * dx - low_x) * MIRROR_TEXELS - 0.5 for r in spread])
-    mirror_rows = jnp.stack([(y + r * dy - low_y) * MIRROR_TEXELS - 0.5 for r in spread])
+    x, y = frame.C[:2] - frame.corner
+    mirror_columns = jnp.stack([(x + r * dx) * MIRROR_TEXELS - 0.5 for r in spread])
+    mirror_rows = jnp.stack([(y + r * dy) * MIRROR_TEXELS - 0.5 for r in spread])
     return columns, rows, (mirror_columns, mirror_rows, strength)
 
 
