@@ -8,12 +8,14 @@ import reference
 
 from sofjax.geometry import SE2, PolarLine, line_through, polar, polar_difference, transfer_line
 from sofjax.geometry.lines import (
+    alignment,
     cofactor,
     direction,
     line_point_distance,
     normal,
     polar_in_frame,
     polar_through,
+    rename_covariance,
 )
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -148,6 +150,17 @@ def test_a_difference_is_the_smallest_of_all_names(rng):
 def test_a_line_differs_from_itself_by_nothing(rng):
     for a in rng.normal(size=(20, 2)) * 3:
         np.testing.assert_allclose(difference(a, a), 0, atol=1e-12)
+
+
+def test_the_covariance_of_the_other_name_is_that_of_its_numbers(rng):
+    lines = rng.multivariate_normal([0, 0], [[4, 1], [1, 2]], size=100)
+    named = lines * [-1, 1] + [0, np.pi]
+    for other, side in ((lines, 1.0), (named, -1.0)):
+        found = rename_covariance(jnp.asarray(np.cov(lines.T)), jnp.array(side))
+        np.testing.assert_allclose(found, np.cov(other.T))
+    for a, b in zip(lines, named, strict=True):
+        assert alignment(line(*a), line(*b)) == -1
+        assert alignment(line(*a), line(*a)) == alignment(line(*b), line(*b)) == 1
 
 
 def test_perpendicular_lines_differ_by_a_right_angle():

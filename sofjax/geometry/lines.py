@@ -61,9 +61,23 @@ def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "*batch 2"]:
     that of `a`, and the angle is axial, in [-pi/2, pi/2].
     """
     turn = a.theta - b.theta
-    half_turns = jnp.round(turn / jnp.pi)  # odd: the two are named from opposite sides
-    aligned = 1 - 2 * jnp.abs(jnp.remainder(half_turns, 2))
-    return jnp.stack([a.rho - aligned * b.rho, turn - jnp.pi * half_turns], axis=-1)
+    half_turns = jnp.round(turn / jnp.pi)
+    return jnp.stack([a.rho - alignment(a, b) * b.rho, turn - jnp.pi * half_turns], axis=-1)
+
+
+def alignment(a: PolarLine, b: PolarLine) -> Float[Array, "*batch"]:
+    """1 where two lines are named from the same side, -1 where from opposite ones."""
+    half_turns = jnp.round((a.theta - b.theta) / jnp.pi)
+    return 1 - 2 * jnp.abs(jnp.remainder(half_turns, 2))
+
+
+def rename_covariance(
+    covariance: Float[Array, "*#batch 2 2"], side: Float[Array, "*#batch"]
+) -> Float[Array, "... 2 2"]:
+    """Covariance of (rho, theta) of lines by their other name where `side` is -1."""
+    same = jnp.ones_like(side)
+    signs = jnp.stack([jnp.stack([same, side], axis=-1), jnp.stack([side, same], axis=-1)], axis=-2)
+    return covariance * signs
 
 
 def polar_in_frame(line_a: PolarLine, T_a_b: SE2) -> PolarLine:
