@@ -1,0 +1,370 @@
+"""Fig. 6 as one step: the same as a scan, compiled once, and better than the odometer."""
+
+import dataclasses
+import functools
+import operator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from conftest import make_camera
+
+from sofjax import slam
+from sofjax.geometry import SE2, Mount, Segments
+from sofjax.motion import MotionModel
+from sofjax.observation import Observation
+from sofjax.presets import DEFAULT, PAPER
+
+T, M, N, K = 40, 32, 64, 96
+
+
+def with_sizes(config):
+    return dataclasses.replace(
+        config,
+        filter=dataclasses.replace(config.filter, particles=N),
+        segment_map=dataclasses.replace(config.segment_map, capacity=K),
+    )
+
+
+CONFIG = with_sizes(DEFAULT)
+MOUNT = Mount.create(height=0.6, pitch=0.2618, x=0.05)
+CAMERA = make_camera()
+
+compiled = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+# one trace for all the images, keys and numbers of every test below
+step = compiled(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
+
+
+def tiles():
+    """A floor of tiles, 60 cm by 90 cm, whose long lines come in pieces."""
+    along = [[[x, y], [x + 2.6, y]] for x in (-1, 1.8, 4.6) for y in (-1.2, -0.6, 0, 0.6, 1.2)]
+    across = [[[0.9 * i, -1.2], [0.9 * i, 1.2]] for i in range(8)]
+    return np.array(along + across)
+
+
+@functools.cache
+def drive():
+    """True poses, what an odometer with systematic errors reads, and what the camera sees."""
+    rng = np.random.default_rng(7)
+    twists = np.column_stack([np.full(T, 0.08), np.zeros(T), 0.04 * np.sin(np.arange(T) / 6)])
+    twists[0] = 0
+    true = [np.eye(3)]
+    read = twists * [1.03, 1, 1.08] + twists[:, :1] * [0, 0, 0.015]
+    read = read + rng.normal(size=(T, 3)) * [0.001, 0, 0.0005] * (twists[:, :1] > 0)
+    ends = np.zeros((T, M, 2, 2))
+    counts = np.zeros(T, int)
+    for i in range(T):
+        if i:
+            arc = SE2.exp(jnp.asarray(twists[i]))
+            true.append(true[-1] @ reference.pose_matrix([*arc.xy, arc.yaw]))
+        seen = reference.look(CAMERA, MOUNT, reference.pose_of(true[-1]), tiles())[:M]
+        counts[i] = len(seen)
+        ends[i, : len(seen)] = seen + rng.normal(0, 0.3, size=seen.shape)
+    segments = Segments(jnp.asarray(ends, "float32"), jnp.arange(M) < jnp.asarray(counts)[:, None])
+    motion = SE2.exp(jnp.asarray(read, "float32"))
+    return np.array([reference.pose_of(m) for m in true]), Observation(
+        segments, motion, jnp.zeros(T, int)
+    )
+
+
+def frame(i):
+    return jax.tree.map(lambda a: a[i], drive()[1])
+
+
+def black(motion):
+    return Observation(
+        Segments(jnp.zeros((M, 2, 2)), jnp.zeros(M, bool)), motion, jnp.zeros((), int)
+    )
+
+
+def start(config=CONFIG, seed=0):
+    return slam.init(config, CAMERA, MOUNT, jax.random.key(seed), M)
+
+
+def stepped(observations, config=CONFIG, seed=0, state=None):
+    state, infos = start(config, seed) if state is None else state, []
+    for observation in observations:
+        state, info = step(config, CAMERA, MOUNT, state, observation)
+        infos.append(info)
+    return state, jax.tree.map(lambda *a: jnp.stack(a), *infos)
+
+
+@functools.cache
+def default_run(seed=0):
+    return stepped(map(frame, range(T)), seed=seed)
+
+
+def odometry(motions):
+    poses, matrix = [], np.eye(3)
+    for xy, yaw in zip(np.asarray(motions.xy), np.asarray(motions.yaw), strict=True):
+        matrix = matrix @ reference.pose_matrix([*xy, yaw])
+        poses.append(reference.pose_of(matrix))
+    return np.array(poses)
+
+
+def trajectory_error(xy):
+    return float(np.sqrt(np.mean(np.sum((np.asarray(xy) - drive()[0][:, :2]) ** 2, axis=1))))
+
+
+def numbers(tree):
+    return [
+        np.asarray(
+            jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        )
+        for leaf in jax.tree.leaves(tree)
+    ]
+
+
+def assert_bitwise_equal(a, b):
+    for x, y in zip(numbers(a), numbers(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def assert_finite(tree):
+    for leaf in numbers(tree):
+        assert np.isfinite(leaf).all()
+
+
+def test_a_short_drive_ends_nearer_to_the_truth_than_its_odometer():
+    _, info = default_run()
+    by_odometer = trajectory_error(odometry(drive()[1].motion)[:, :2])
+    assert by_odometer > 0.05
+    assert trajectory_error(info.T_world_robot.xy) < 0.3 * by_odometer
+    yaw = np.asarray(info.T_world_robot.yaw) - drive()[0][:, 2]
+    assert np.abs(yaw).max() < 0.01
+    assert not info.lost.any()
+
+
+def test_the_map_of_a_short_drive_lies_on_the_floor_s_lines():
+    state, _ = default_run()
+    found = slam.final_map(CONFIG, MOUNT, state.segment_map)
+    assert found.is_floor.sum() > 8
+    for ends in np.asarray(found.endpoints_world)[np.asarray(found.is_floor)]:
+        distances = []
+        for a, b in tiles():
+            d = (b - a) / np.linalg.norm(b - a)
+            distances.append(np.abs((ends - a) @ [-d[1], d[0]]).max())
+        assert min(distances) < 0.04
+
+
+def test_the_odometer_s_distance_error_is_learned():
+    """It reads 3 % too much: the motion is what was read divided by 1.03."""
+    _, info = default_run()
+    assert info.bias[-1, 0] == pytest.approx(1 / 1.03 - 1, abs=0.012)
+
+
+def test_a_scan_is_one_step_after_the_other():
+    """In float64: the compiler rounds a loop's body otherwise, and resampling magnifies that."""
+    # indices of top_k stay int32
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        as_float64 = functools.partial(
+            jax.tree.map, lambda a: a.astype(float) if a.dtype == "float32" else a
+        )
+        camera, mount, observations = as_float64((CAMERA, MOUNT, drive()[1]))
+        one_step, scan = (compiled(f.__wrapped__) for f in (slam.step, slam.run))
+        one = state = slam.init(CONFIG, camera, mount, jax.random.key(0), M)
+        scanned_state, scanned = scan(CONFIG, camera, mount, state, observations)
+        for i in range(T):
+            observation = jax.tree.map(operator.itemgetter(i), observations)
+            one, info = one_step(CONFIG, camera, mount, one, observation)
+            for a, b in zip(numbers(scanned), numbers(info), strict=True):
+                np.testing.assert_allclose(a[i], b, rtol=1e-6, atol=1e-9)
+        for a, b in zip(numbers(scanned_state), numbers(one), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
+
+
+def test_the_state_keeps_its_types_from_the_first_step_on():
+    """Or the second image would be compiled anew."""
+    before = start()
+    after, _ = jax.eval_shape(slam.step, CONFIG, CAMERA, MOUNT, before, frame(0))
+    for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        assert getattr(a, "weak_type", False) == b.weak_type
+
+
+def test_other_numbers_in_the_settings_are_not_compiled_anew():
+    """`step` may be traced once in this file; sizes and kinds are static, numbers are not."""
+    sensor = dataclasses.replace(CONFIG.sensor, pixel_sigma=0.7)
+    rules = dataclasses.replace(CONFIG.segment_map, range=4.0)
+    stepped([frame(0)], dataclasses.replace(CONFIG, sensor=sensor, segment_map=rules))
+
+
+def test_the_same_key_gives_the_same_run_bit_for_bit():
+    first, again = (stepped(map(frame, range(6)), seed=3) for _ in range(2))
+    assert_bitwise_equal(first, again)
+
+
+def test_another_key_gives_another_run():
+    _, first = stepped(map(frame, range(6)), seed=3)
+    _, other = stepped(map(frame, range(6)), seed=4)
+    assert (np.asarray(first.T_world_robot.xy[1:]) != np.asarray(other.T_world_robot.xy[1:])).all()
+
+
+def test_the_first_image_begins_no_lines_and_a_baseline_later_some_are_known():
+    _, info = default_run()
+    assert info.born[0] == info.associated[0] == info.matched[0] == 0
+    assert info.associated[4:].min() > 0
+    assert info.matched[6:].min() > 0
+
+
+def test_the_funnel_narrows():
+    _, info = default_run()
+    np.testing.assert_array_equal(info.detected, drive()[1].segments_image.valid.sum(axis=1))
+    for wide, narrow in (
+        (info.detected, info.below_horizon),
+        (info.below_horizon, info.associated),
+        (info.below_horizon, info.matched + info.born),
+    ):
+        assert (wide >= narrow).all()
+    counts = (np.asarray(info.segment_class)[..., None] >= [1, 2, 3]).sum(axis=1)
+    np.testing.assert_array_equal(counts[:, 0], info.detected)
+    np.testing.assert_array_equal(counts[:, 1], info.below_horizon)
+    assert (counts[:, 2] >= info.matched + info.born).all()
+
+
+def test_the_map_counts_what_was_born():
+    state, info = default_run()
+    assert 0 < state.segment_map.valid.sum() <= info.born.sum()
+
+
+def test_black_images_leave_the_map_as_it_is_and_follow_the_odometer():
+    silent = MotionModel(*[0.0] * 8)
+    config = dataclasses.replace(CONFIG, motion=silent)
+    state, _ = stepped(map(frame, range(8)), config)
+    motions = jax.tree.map(lambda a: a[8:20], drive()[1].motion)
+    dark = [black(SE2(xy, yaw)) for xy, yaw in zip(motions.xy, motions.yaw, strict=True)]
+    after, info = stepped(dark, config, state=state)
+    assert_bitwise_equal(after.segment_map, state.segment_map)
+    begin = slam.mean_pose(state.particles)
+    here = reference.pose_matrix([*begin.xy, begin.yaw])
+    expected = [reference.pose_of(here @ reference.pose_matrix(p)) for p in odometry(motions)]
+    np.testing.assert_allclose(info.T_world_robot.xy, np.array(expected)[:, :2], atol=1e-5)
+    np.testing.assert_allclose(info.T_world_robot.yaw, np.array(expected)[:, 2], atol=1e-5)
+
+
+def test_black_images_with_a_noisy_odometer_are_followed_in_the_mean():
+    state, _ = default_run()
+    dark = [black(SE2(jnp.array([0.1, 0.0]), jnp.array(0.0, float)))] * 12
+    after, info = stepped(dark, state=state)
+    assert_bitwise_equal(after.segment_map, state.segment_map)
+    way = np.linalg.norm(np.asarray(info.T_world_robot.xy[-1] - info.T_world_robot.xy[0]))
+    assert way == pytest.approx(1.1 * (1 + float(info.bias[0, 0])), abs=0.01)
+    np.testing.assert_array_equal(info.lost, np.arange(12) >= slam.LOST_AFTER - 1)
+    spread = after.particles.T_world_robot.xy.std(axis=0)
+    assert (spread > state.particles.T_world_robot.xy.std(axis=0)).all()
+
+
+def test_after_the_dark_the_drive_goes_on():
+    state, _ = stepped(map(frame, range(20)))
+    motions = jax.tree.map(lambda a: a[20:26], drive()[1].motion)
+    dark = [black(SE2(xy, yaw)) for xy, yaw in zip(motions.xy, motions.yaw, strict=True)]
+    state, _ = stepped(dark, state=state)
+    _, info = stepped(map(frame, range(26, T)), state=state)
+    assert not info.lost.any()
+    error = np.asarray(info.T_world_robot.xy) - drive()[0][26:, :2]
+    assert np.abs(error).max() < 0.05
+
+
+def image(*ends):
+    padded = np.zeros((M, 2, 2))
+    padded[: len(ends)] = np.asarray(ends, float).reshape(-1, 2, 2)
+    return Segments(jnp.asarray(padded, "float32"), jnp.arange(M) < len(ends))
+
+
+HORIZON = 119.5 - 270 * np.tan(0.2618)
+DEGENERATE = {
+    "none": image(),
+    "without length": image(*[[[160, 200], [160, 200]]] * 3),
+    "all the same": image(*[[[60, 200], [260, 205]]] * M),
+    "above the horizon": image([[10, 5], [300, 9]]),
+    "on the horizon": image([[10, HORIZON], [300, HORIZON]]),
+    "across the horizon": image([[10, 200], [300, 5]], [[160, 239], [160, 0]]),
+    "far out of the image": image([[-1e6, 1e6], [1e6, 2e6]], [[1e6, 200], [2e6, 200]]),
+    "tiny": image([[160, 200], [160.001, 200]]),
+    "through the principal point": image([[159.5, 119.5], [159.5, 200]]),
+    "full": image(*np.random.default_rng(0).uniform([0, 0], [320, 240], size=(M, 2, 2))),
+}
+MOTIONS = {
+    "no motion": (0.0, 0.0, 0.0),
+    "a step": (0.2, 0.0, 0.0),
+    "on the spot": (0.0, 0.0, 1.0),
+    "half a turn": (0.0, 0.0, np.pi),
+    "a leap backwards": (-50.0, 3.0, -3.0),
+}
+
+
+@pytest.mark.parametrize("segments", DEGENERATE.values(), ids=DEGENERATE)
+def test_no_input_makes_a_number_that_is_none(segments):
+    state = start()
+    for motion in MOTIONS.values():
+        x, y, yaw = motion
+        observation = Observation(
+            segments, SE2(jnp.array([x, y], float), jnp.array(yaw, float)), jnp.zeros((), int)
+        )
+        for _ in range(2):
+            state, info = step(CONFIG, CAMERA, MOUNT, state, observation)
+            assert_finite((state, info))
+
+
+def test_the_weights_stay_normalised():
+    state, info = default_run()
+    assert jax.nn.logsumexp(state.particles.log_weight) == pytest.approx(0, abs=1e-4)
+    assert (info.effective_size >= 1 - 1e-3).all() and (info.effective_size <= N + 1e-2).all()
+
+
+def test_the_paper_s_settings_run_with_a_single_winner():
+    config = with_sizes(PAPER)
+    paper = compiled(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
+    state, errors = start(config), []
+    for i in range(T):
+        state, info = paper(config, CAMERA, MOUNT, state, frame(i))
+        assert_finite((state, info))
+        # the next particles are all drawn from the one that was chosen
+        np.testing.assert_array_equal(
+            state.particles.T_world_robot.xy,
+            jnp.broadcast_to(state.particles.T_world_robot.xy[0], (N, 2)),
+        )
+        np.testing.assert_allclose(
+            state.particles.T_world_robot.xy[0], info.T_world_robot.xy, atol=1e-5
+        )
+        errors.append(np.linalg.norm(info.T_world_robot.xy - drive()[0][i, :2]))
+    assert state.segment_map.valid.sum() > 5
+    np.testing.assert_array_equal(state.segment_map.line[:, 2], 1)  # no heights
+    np.testing.assert_array_equal(state.particles.bias.mean, 0)  # no systematic errors
+    by_odometer = trajectory_error(odometry(drive()[1].motion)[:, :2])
+    assert np.sqrt(np.mean(np.square(errors))) < by_odometer
+
+
+# The final map
+
+
+def test_the_final_map_worked_by_hand():
+    """Seen often, in most images that should show it, of known height, and on the floor."""
+    rules = CONFIG.segment_map
+    cases = [  # kappa, its sigma, updates, expected, valid -> of the map
+        (1.0, 0.01, 20, 20, True, True),
+        (1.0, 0.01, rules.min_updates - 1, 4, True, False),
+        (1.0, 0.01, 20, 200, True, False),  # a tenth of the images that should have shown it
+        (1.2, 0.01, 20, 20, True, False),  # the top of a baseboard
+        (1.0, 0.20, 20, 20, True, False),  # who knows
+        (1.0, 0.01, 20, 20, False, False),
+    ]
+    kappa, sigma, updates, expected, valid, of_the_map = map(np.array, zip(*cases, strict=True))
+    n = len(cases)
+    empty = start().segment_map
+    m = dataclasses.replace(
+        empty,
+        segments_world=Segments(empty.segments_world.endpoints, empty.valid.at[:n].set(valid)),
+        line=empty.line.at[:n, 2].set(kappa),
+        covariance=empty.covariance.at[:n, 2, 2].set(sigma**2),
+        updates=empty.updates.at[:n].set(updates),
+        expected=empty.expected.at[:n].set(expected),
+    )
+    found = slam.final_map(CONFIG, MOUNT, m)
+    np.testing.assert_array_equal(found.is_floor[:n], of_the_map)
+    assert not found.is_floor[n:].any()
+    np.testing.assert_allclose(found.height[3], 0.6 - 0.6 / 1.2, rtol=1e-5)
+    np.testing.assert_allclose(found.height_sigma[:n], 0.6 * sigma / kappa**2, rtol=1e-4)
