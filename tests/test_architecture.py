@@ -1,0 +1,117 @@
+"""The direction of imports, and where files, printing, cv2 and matplotlib are known."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sofjax
+
+PACKAGE = Path(__file__).parent.parent / "sofjax"
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+# each room imports from those before it; to add one is to say where it stands
+ROOMS = """
+    geometry observation association sof motion likelihood particles segment_map slam presets
+    batch smoothing loop_closure calibration io vision evaluation simulation viewer cli
+""".split()
+CORE = ROOMS[: ROOMS.index("io")]
+MATHS = {"jax", "jaxtyping", "equinox", "optimistix", "lineax", "numpy", "sofjax"}
+
+
+def room_of(file):
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def in_room(*rooms):
+    return [file for file in FILES if room_of(file) in rooms]
+
+
+def imports(file):
+    """Every module that a file names, inside functions too; `from sofjax import x` is sofjax.x."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: imports are absolute"
+            if node.module == "sofjax":
+                yield from (f"sofjax.{alias.name}" for alias in node.names)
+            else:
+                yield node.module
+
+
+def calls(file):
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            yield node.func.id
+
+
+def names(files):
+    return [str(file.relative_to(PACKAGE)) for file in files]
+
+
+@pytest.mark.parametrize(
+    "file",
+    [f for f in FILES if not room_of(f).startswith("__")],
+    ids=lambda f: str(f.relative_to(PACKAGE)),
+)
+def test_imports_point_one_way(file):
+    assert room_of(file) in ROOMS, "a room of its own has a place in ROOMS"
+    for module in imports(file):
+        top, *inner = module.split(".")
+        if top == "sofjax" and inner:
+            assert ROOMS.index(inner[0]) <= ROOMS.index(room_of(file)), module
+
+
+def test_the_ground_knows_jax_and_equinox_alone():
+    for file in in_room("geometry"):
+        assert {module.split(".")[0] for module in imports(file)} <= MATHS - {"numpy", "optimistix"}
+
+
+def test_the_core_knows_no_more_than_mathematics():
+    for file in in_room(*CORE):
+        modules = {module.split(".")[0] for module in imports(file)}
+        assert modules - sys.stdlib_module_names <= MATHS, file
+
+
+@pytest.mark.parametrize(
+    ("library", "rooms"), [("cv2", {"vision", "simulation"}), ("matplotlib", {"viewer"})]
+)
+def test_a_heavy_library_is_known_in_one_place(library, rooms):
+    knowing = [f for f in FILES if any(m.split(".")[0] == library for m in imports(f))]
+    assert {room_of(file) for file in knowing} <= rooms, names(knowing)
+    assert names(f for f in knowing if room_of(f) == "simulation") in (
+        [],
+        ["simulation/drawing.py"],
+    )
+
+
+def test_the_core_opens_no_file_and_only_commands_print():
+    opening = {"open", "print", "input", "exit"}
+    assert not names(f for f in in_room(*CORE, "__init__") if opening & set(calls(f)))
+    assert {room_of(file) for file in FILES if "print" in calls(file)} <= {"cli"}
+    exits = {file for file in FILES if {"exit", "quit"} & set(calls(file))}
+    assert {room_of(file) for file in exits} <= {"cli", "__main__"}
+
+
+def modules_after(code):
+    code = f"import sys; {code}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    heavy = {"cv2", "matplotlib", "optimistix", "scipy", "yaml"}
+    assert not heavy & modules_after("import sofjax")
+    rooms = ", ".join(f"sofjax.{room}" for room in CORE if in_room(room))
+    assert not {"cv2", "matplotlib", "yaml"} & modules_after(f"import {rooms}")
+
+
+def test_every_public_name_is_there():
+    for name in sofjax.__all__:
+        assert getattr(sofjax, name) is not None
+        assert name in dir(sofjax)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        sofjax.nothing  # noqa: B018
