@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from sofjax.cli import demo, evaluate, inspect, run, simulate
+from sofjax.cli import calibrate, demo, evaluate, inspect, run, simulate
 from sofjax.io.errors import InputError
 
 
@@ -41,6 +41,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"sofjax {version('sofjax')}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (run, evaluate, inspect, simulate, demo):
+    for command in (run, evaluate, inspect, calibrate, simulate, demo):
         command.add_parser(commands)
     return parser

@@ -1,7 +1,7 @@
 """`camera.yaml`: a ROS camera_info file, and under `mount:` where the camera sits on the robot."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +15,10 @@ from sofjax.io.yaml_text import parse_yaml
 
 MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # coefficients
 MOUNT_FIELDS = ("x", "y", "height", "pitch", "roll", "yaw")
+TO_FILL_IN = {  # what stands in a new file for what only the user knows
+    "height": "fill in the metres from the floor to the lens",
+    "pitch": "fill in the radians that the camera looks down",
+}
 MAX_PIXELS = 16384  # a side; more is a slip, and would fill the memory
 
 
@@ -42,7 +46,7 @@ def read_camera(path: Path) -> CameraFile:
     K = _intrinsics(path, fields, width, height)
     model, distortion = _distortion(path, fields)
     mount = _mount(path, fields)
-    _check_floor_in_view(path, K, width, height, mount)
+    check_floor_in_view(f"{path}", K, width, height, mount)
     return CameraFile(
         camera=Camera(jnp.asarray(K, float), width, height),
         mount=Mount.create(**mount),
@@ -54,24 +58,77 @@ def read_camera(path: Path) -> CameraFile:
 
 def write_camera(path: Path, camera_file: CameraFile) -> None:
     """Write a camera file that `read_camera` reads back, number for number."""
-    camera, mount = camera_file.camera, camera_file.mount
-    distortion = ", ".join(map(_shortest, camera_file.distortion))
-    name = "".join(c for c in camera_file.name if c.isprintable()).replace("'", "''")
-    placed = ", ".join(f"{key}: {_shortest(getattr(mount, key))}" for key in MOUNT_FIELDS)
+    mount = camera_file.mount
+    write_intrinsics(
+        path,
+        camera_file.camera,
+        camera_file.distortion_model,
+        camera_file.distortion,
+        camera_file.name,
+        {key: getattr(mount, key) for key in MOUNT_FIELDS},
+    )
+
+
+def write_intrinsics(
+    path: Path,
+    camera: Camera,
+    distortion_model: str,
+    distortion: np.ndarray,
+    name: str,
+    mount: Mapping[str, object],
+    notes: Sequence[str] = (),
+) -> None:
+    """Write a camera file of whose mount only some fields may be known.
+
+    Where the height or the pitch is missing `TO_FILL_IN` stands in its place, and `read_camera`
+    refuses the file until it is filled in.
+
+    **Arguments:**
+    - `mount`: metres and radians by the names of `Mount`'s fields.
+    - `notes`: lines to stand as comments at the top.
+    """
+    placed = ", ".join(
+        f"{key}: {_shortest(mount[key]) if key in mount else TO_FILL_IN.get(key, 0.0)}"
+        for key in MOUNT_FIELDS
+    )
     K = ", ".join(map(_shortest, np.asarray(camera.K).ravel()))
-    n = len(camera_file.distortion)
+    data = ", ".join(map(_shortest, distortion))
+    name = "".join(c for c in name if c.isprintable()).replace("'", "''")
+    comments = "".join(f"# {note}\n" for note in notes)
     write_atomically(
         Path(path),
         "# camera_info, with the mount of the camera on the robot: metres, radians, "
         "pitch > 0 looks down\n"
+        f"{comments}"
         f"image_width: {camera.width}\n"
         f"image_height: {camera.height}\n"
         f"camera_name: '{name}'\n"
         f"camera_matrix: {{rows: 3, cols: 3, data: [{K}]}}\n"
-        f"distortion_model: {camera_file.distortion_model}\n"
-        f"distortion_coefficients: {{rows: 1, cols: {n}, data: [{distortion}]}}\n"
+        f"distortion_model: {distortion_model}\n"
+        f"distortion_coefficients: {{rows: 1, cols: {len(distortion)}, data: [{data}]}}\n"
         f"mount: {{{placed}}}\n",
     )
+
+
+def mount_fields(where: str, text: str) -> dict[str, float]:
+    """Some fields of a mount as 'height=0.6,pitch=0.26', checked; metres and radians."""
+    given: dict[str, object] = {}
+    for pair in text.split(","):
+        key, equals, value = (part.strip() for part in pair.partition("="))
+        if not equals:
+            raise InputError(f"{where}: '{pair:.40}' must have the form height=0.6,pitch=0.26")
+        if key in given:
+            raise InputError(f"{where}: '{key}' is given twice")
+        given[key] = value
+    return _mount_numbers(where, given)
+
+
+def known_mount(path: Path) -> dict[str, float]:
+    """The fields of the mount in a camera file that are filled in; none if there is no mount."""
+    text = read_text(path, "the camera file", SETTINGS_BYTES)
+    fields = _mapping(f"{path}", parse_yaml(text, str(path)))
+    mount = _mapping(f"{path}: 'mount'", fields.get("mount", {}))
+    return _mount_numbers(f"{path}: 'mount'", mount)
 
 
 def doubts(camera_file: CameraFile) -> list[str]:
@@ -91,6 +148,19 @@ def doubts(camera_file: CameraFile) -> list[str]:
     if float(mount.height) > 3:
         found.append(f"the camera is {float(mount.height):g} m above the floor: is it in metres?")
     return found
+
+
+def check_floor_in_view(
+    where: str, K: np.ndarray, width: int, height: int, mount: Mapping[str, float]
+) -> None:
+    """Refuse a mount that has the whole image above the horizon."""
+    right, bottom = width - 1, height - 1
+    corners = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1]])
+    if (corners @ horizon_image(K, mount["pitch"], mount["roll"]) <= 0).all():
+        raise InputError(
+            f"{where}: with the pitch {mount['pitch']:g} of 'mount' the whole image is above the "
+            "horizon; pitch > 0 looks down, in radians"
+        )
 
 
 def horizon_image(K: np.ndarray, pitch: float, roll: float) -> np.ndarray:
@@ -182,41 +252,36 @@ def _mount(path: Path, fields: Mapping) -> dict[str, float]:
             "such as 'mount: {x: 0.1, y: 0, height: 0.6, pitch: 0.26, roll: 0, yaw: 0}'"
         )
     given = _mapping(f"{path}: 'mount'", fields["mount"])
+    mount = _mount_numbers(f"{path}: 'mount'", given)
+    for key, what in TO_FILL_IN.items():
+        if key not in mount:
+            raise InputError(f"{path}: 'mount' must have a '{key}'; {what}")
+    return dict.fromkeys(MOUNT_FIELDS, 0.0) | mount
+
+
+def _mount_numbers(where: str, given: Mapping) -> dict[str, float]:
+    """The fields of a mount that are filled in, each a number that can be one."""
+    given = {key: v for key, v in given.items() if v is None or v != TO_FILL_IN.get(key)}
     for key in given:
         if key not in MOUNT_FIELDS:
             hint = nearest(str(key), MOUNT_FIELDS)
-            raise InputError(f"{path}: 'mount' has no field {key!r:.60}; {hint}")
-    for key in ("height", "pitch"):
-        if key not in given:
-            raise InputError(f"{path}: 'mount' must have a '{key}'")
-    mount = {key: _number(f"{path}: 'mount.{key}'", given.get(key, 0.0)) for key in MOUNT_FIELDS}
-    if not 0 < mount["height"] <= 100:
+            raise InputError(f"{where} has no field {key!r:.60}; {hint}")
+    mount = {key: _number(f"{where}: '{key}'", value) for key, value in given.items()}
+    if not 0 < mount.get("height", 1.0) <= 100:
         raise InputError(
-            f"{path}: 'mount.height' is {mount['height']:g}; it must be the metres of the camera "
+            f"{where}: 'height' is {mount['height']:g}; it must be the metres of the camera "
             "above the floor, greater than 0"
         )
     for key in ("x", "y"):
-        if abs(mount[key]) > 100:
-            raise InputError(f"{path}: 'mount.{key}' is {mount[key]:g}; it must be in metres")
+        if abs(mount.get(key, 0.0)) > 100:
+            raise InputError(f"{where}: '{key}' is {mount[key]:g}; it must be in metres")
     for key, limit in (("pitch", math.pi / 2), ("roll", math.pi), ("yaw", 2 * math.pi)):
-        if abs(mount[key]) > limit:
+        if abs(mount.get(key, 0.0)) > limit:
             raise InputError(
-                f"{path}: 'mount.{key}' is {mount[key]:g}; angles are in radians, at most "
+                f"{where}: '{key}' is {mount[key]:g}; angles are in radians, at most "
                 f"{limit:.4f} either way (15 degrees are 0.2618)"
             )
     return mount
-
-
-def _check_floor_in_view(
-    path: Path, K: np.ndarray, width: int, height: int, mount: dict[str, float]
-) -> None:
-    right, bottom = width - 1, height - 1
-    corners = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1]])
-    if (corners @ horizon_image(K, mount["pitch"], mount["roll"]) <= 0).all():
-        raise InputError(
-            f"{path}: with the pitch {mount['pitch']:g} of 'mount' the whole image is above the "
-            "horizon; pitch > 0 looks down, in radians"
-        )
 
 
 def _shortest(value: object) -> str:

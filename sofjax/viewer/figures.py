@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sofjax.viewer.sheet import line_drawer, new_figure, save
+
 MISSING = "matplotlib is not installed, so there is no figure: pip install 'sofjax[figures]'"
 
 PATH, ODOMETRY, FLOOR, OTHER, TRUTH = "#c0392b", "#e08e0b", "#1f4e9c", "#d4447c", "#b9c0c7"
@@ -37,8 +39,8 @@ def draw_map(
     width, height = high - low
     scale = min(8.0 / width, 8.0 / height)  # inches a metre
     size = (max(3.0, scale * width) + 3.2, max(3.0, scale * height) + 0.9)
-    figure, axes = _figure(size)
-    lines = _collection(axes)
+    figure, axes = new_figure(size)
+    lines = line_drawer(axes)
     if true_segments is not None:
         lines(true_segments, TRUTH, 3.0, "true segments on the floor", 1)
     if true_robot is not None:
@@ -60,7 +62,7 @@ def draw_map(
     figure.legend(loc="outside right upper", frameon=False, fontsize=9)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_images(
@@ -82,13 +84,13 @@ def draw_images(
     columns = min(len(images), 3)
     rows = -(-len(images) // columns)
     height, width = images[0].shape
-    figure, grid = _figure((4.2 * columns, 4.2 * rows * height / width + 0.8), rows, columns)
+    figure, grid = new_figure((4.2 * columns, 4.2 * rows * height / width + 0.8), rows, columns)
     for axes in np.ravel(grid):
         axes.set_axis_off()
     panels = zip(np.ravel(grid), names, images, floor, other, strict=False)
     for axes, name, image, on, off in panels:
         axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-        lines = _collection(axes)
+        lines = line_drawer(axes)
         lines(off, OTHER, 1.4, None, 2)
         lines(on, "#2ecc40", 1.8, None, 3)
         axes.set_title(f"{name}: {len(on)} floor, {len(off)} not", fontsize=8)
@@ -98,32 +100,7 @@ def draw_images(
     ]
     figure.suptitle(title, fontsize=10)
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
-    _save(figure, path)
-
-
-def _figure(size: tuple[float, float], rows: int = 1, columns: int = 1):
-    """A figure of its own, apart from pyplot's and the user's."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns)
-
-
-def _collection(axes):
-    from matplotlib.collections import LineCollection
-
-    def lines(segments, color, width, label, zorder):
-        axes.add_collection(
-            LineCollection(
-                list(segments), colors=color, linewidths=width, label=label, zorder=zorder,
-                capstyle="round",
-            ),
-            autolim=False,
-        )  # fmt: skip
-
-    return lines
+    save(figure, path)
 
 
 def _bounds(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -132,14 +109,3 @@ def _bounds(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     low, high = points.min(0), points.max(0)
     margin = np.maximum(0.04 * (high - low).max(), 0.2)
     return low - margin, high + margin
-
-
-def _save(figure, path: Path) -> None:
-    beside = path.with_name(f".{path.name}.part")
-    try:
-        figure.savefig(
-            beside, dpi=150, format="png", bbox_inches="tight", metadata={"Software": "sofjax"}
-        )
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)

@@ -1,0 +1,247 @@
+"""Intrinsics from views of a checkerboard, "a common checkboard method" of section IV."""
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+MIN_VIEWS = 5
+WINDOW = 0.4  # of the way to the next corner, within which one is refined ...
+MAX_WINDOW = 11  # ... in pixels at most: farther out the lens bends the lines
+OUTLIER = 3.0  # times the median error of the views
+NEGLIGIBLE = 0.1  # pixels, below which no view is an outlier
+MIN_TILT = 10.0  # degrees, below which focal length and distance cannot be told apart
+SIGNIFICANT = 2.0  # standard deviations from 0 without which k3 is left out
+TERMS = ("k1", "k2", "p1", "p2", "k3")
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard, by its inner corners: those at which four squares meet."""
+
+    columns: int
+    rows: int
+    square: float  # metres
+
+    @property
+    def points(self) -> np.ndarray:
+        """[N, 3] corners in the board's frame, row after row, metres."""
+        rows, columns = np.mgrid[: self.rows, : self.columns]
+        flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1)
+        return self.square * flat.reshape(-1, 3).astype(np.float32)
+
+    def __str__(self) -> str:
+        return f"{self.columns}x{self.rows}"
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """One image of the board, as the fitted camera explains it."""
+
+    name: str
+    corners: np.ndarray  # [N, 2] as found, pixels of the image as taken
+    residuals: np.ndarray  # [N, 2] found minus projected, pixels
+    distance: float  # metres from the optical centre to the board's middle
+    tilt: float  # radians between the board's normal and the ray to its middle
+    used: bool  # or left out of the fit, as an outlier
+
+    @property
+    def error(self) -> float:
+        """Root mean square of the residuals' lengths, pixels."""
+        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """Intrinsics with one standard deviation each, by the residuals of the used views."""
+
+    width: int  # pixels
+    height: int  # pixels
+    intrinsics: np.ndarray  # [4] fx, fy, cx, cy, pixels
+    intrinsics_sigma: np.ndarray  # [4]
+    distortion: np.ndarray  # [5] of the model plumb_bob; k3 is 0 where nothing speaks for one
+    distortion_sigma: np.ndarray  # [5]
+    views: list[BoardView]
+    error: float  # root mean square over the used views, pixels
+
+    @property
+    def K(self) -> np.ndarray:
+        fx, fy, cx, cy = self.intrinsics
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+    @property
+    def focal_uncertainty(self) -> float:
+        """Standard deviation of the focal length, as a share of it."""
+        return float((self.intrinsics_sigma[:2] / self.intrinsics[:2]).max())
+
+
+def find_corners(image: np.ndarray, board: Board) -> np.ndarray | None:
+    """Corners [N, 2] in the order of the board's, pixels; None unless all of them are in view.
+
+    Found by OpenCV's sector-based search, or else by its older one, then refined where the edges
+    around each cross, within a window that no other corner reaches into.
+    """
+    size = (board.columns, board.rows)
+    search = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+    found, corners = cv2.findChessboardCornersSB(image, size, flags=search)
+    if not found:
+        search = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(image, size, flags=search)
+    if not found:
+        return None
+    grid = corners.reshape(board.rows, board.columns, 2)
+    gap = min(np.linalg.norm(np.diff(grid, axis=a), axis=-1).min() for a in (0, 1))
+    window = int(np.clip(WINDOW * gap, 2, MAX_WINDOW))
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
+    refined = cv2.cornerSubPix(
+        image, np.float32(corners).copy(), (window, window), (-1, -1), stop
+    )
+    return refined.reshape(-1, 2)
+
+
+def fit_camera(
+    board: Board, width: int, height: int, names: list[str], corners: list[np.ndarray]
+) -> CameraFit:
+    """Intrinsics from the corners [N, 2] of some views; views that do not go with the others go.
+
+    **Raises:** `ValueError` if OpenCV finds no camera that could have taken them.
+    """
+    used = list(range(len(corners)))
+    while True:
+        solution = _solve(board, width, height, [corners[i] for i in used])
+        errors = solution.errors
+        worst = int(errors.argmax())
+        limit = max(OUTLIER * float(np.median(errors)), NEGLIGIBLE)
+        if errors[worst] <= limit or len(used) <= MIN_VIEWS:
+            break
+        del used[worst]
+    poses = dict(zip(used, solution.poses, strict=True))
+    views = [
+        _view(board, solution, name, found, poses.get(i))
+        for i, (name, found) in enumerate(zip(names, corners, strict=True))
+    ]
+    return CameraFit(
+        width,
+        height,
+        intrinsics=solution.K[[0, 1, 0, 1], [0, 1, 2, 2]],
+        intrinsics_sigma=solution.sigma[:4],
+        distortion=solution.distortion,
+        distortion_sigma=solution.sigma[4:9],
+        views=views,
+        error=solution.error,
+    )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    K: np.ndarray
+    distortion: np.ndarray  # [5]
+    sigma: np.ndarray  # [9] of fx, fy, cx, cy and the distortion
+    poses: list[tuple[np.ndarray, np.ndarray]]  # rotation vector and translation of each view
+    errors: np.ndarray  # [V] pixels
+    error: float
+
+
+def _solve(board: Board, width: int, height: int, corners: list[np.ndarray]) -> _Solution:
+    """One fit; k3 is zero unless the views speak for it: far from the corners it runs away."""
+    for flags in (0, cv2.CALIB_FIX_K3):
+        try:
+            error, K, distortion, R, t, sigma, _, errors = cv2.calibrateCameraExtended(
+                [board.points] * len(corners),
+                [np.float32(found) for found in corners],
+                (width, height),
+                None,
+                None,
+                flags=flags,
+            )
+        except cv2.error:
+            raise ValueError("no camera explains these views of the board") from None
+        sigma, distortion = sigma.ravel()[:9], distortion.ravel()[:5]
+        if not (np.isfinite(K).all() and np.isfinite(sigma).all() and math.isfinite(error)):
+            raise ValueError("no camera explains these views of the board")
+        if abs(distortion[4]) > SIGNIFICANT * sigma[8]:
+            break
+    poses = list(zip(R, t, strict=True))
+    return _Solution(K, distortion, sigma, poses, errors.ravel(), float(error))
+
+
+def _view(
+    board: Board, solution: _Solution, name: str, corners: np.ndarray, pose: tuple | None
+) -> BoardView:
+    """A view under the final camera; where it was no part of the fit, with its own best pose."""
+    camera = solution.K, solution.distortion
+    R, t = pose or cv2.solvePnP(board.points, np.float32(corners), *camera)[1:]
+    projected = cv2.projectPoints(board.points, R, t, *camera)[0].reshape(-1, 2)
+    rotation = cv2.Rodrigues(R)[0]
+    middle = rotation @ board.points.mean(0) + t.ravel()
+    distance = float(np.linalg.norm(middle))
+    facing = min(abs(float(rotation[:, 2] @ middle)) / distance, 1.0)
+    return BoardView(name, corners, corners - projected, distance, math.acos(facing), bool(pose))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a fit is worth, in words."""
+
+    word: str  # good, usable or not usable
+    reasons: list[str]  # how well the camera is known, and what would make it better
+
+    @property
+    def usable(self) -> bool:
+        return self.word != "not usable"
+
+    @property
+    def sentence(self) -> str:
+        return f"{self.word}: {'; '.join(self.reasons)}"
+
+
+def judge(fit: CameraFit) -> Verdict:
+    """Say what a fit is worth: by its standard deviations, its residuals and its views."""
+    used = [view for view in fit.views if view.used]
+    size = np.array([fit.width, fit.height])
+    share, centre = fit.focal_uncertainty, float((fit.intrinsics_sigma[2:] / size).max())
+    fx, fy, cx, cy = fit.intrinsics
+    tilt = math.degrees(max(view.tilt for view in used))
+    advice = []
+    if tilt < 20:
+        advice.append(
+            f"the board is never tilted by more than {tilt:.0f}°: without tilts of 30° and more "
+            "a long focal length looks like a near board"
+        )
+    if len(used) < 10:
+        advice.append(f"{len(used)} views are few: take 15 to 20")
+    empty = _empty_parts(np.concatenate([view.corners for view in used]), size)
+    if empty:
+        advice.append(
+            f"no corner lies in the {', '.join(empty)} of the image: the lens is guessed there"
+        )
+    if fit.error > 0.5:
+        advice.append(
+            f"the residuals of {fit.error:.2f} px are large: is the board flat, are the images "
+            "sharp, is the lens a fisheye?"
+        )
+    off = float(np.abs(np.array([cx, cy]) / size - 0.5).max())
+    if tilt < MIN_TILT:  # the fit may then rest far from the truth, and the sigmas do not tell
+        word, known = "not usable", "the views do not fix the focal length"
+    elif share > 0.03 or centre > 0.05 or abs(fx / fy - 1) > 0.2 or off > 0.35:
+        word, known = "not usable", "the views do not fix the camera"
+    else:
+        word = "usable" if advice or share > 0.005 else "good"
+        known = (
+            f"the focal length is known to {100 * share:.2g} % and the centre to "
+            f"{fit.intrinsics_sigma[2:].max():.2g} px"
+        )
+    return Verdict(word, [known, *advice])
+
+
+def _empty_parts(points: np.ndarray, size: np.ndarray) -> list[str]:
+    """Ninths of the image without one of the points [n, 2]."""
+    names = [
+        ["top left", "top", "top right"],
+        ["left", "middle", "right"],
+        ["bottom left", "bottom", "bottom right"],
+    ]
+    cells = np.clip((3 * points / size).astype(int), 0, 2)
+    seen = {(row, column) for column, row in cells.tolist()}
+    return [names[i][j] for i in range(3) for j in range(3) if (i, j) not in seen]

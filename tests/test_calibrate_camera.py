@@ -1,0 +1,330 @@
+"""Intrinsics from rendered views of a checkerboard, whose camera is known."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sofjax import viewer
+from sofjax.cli import main
+from sofjax.io.camera_file import known_mount, mount_fields, read_camera
+from sofjax.io.drive import read_drive
+from sofjax.io.errors import InputError
+from sofjax.vision.checkerboard import Board, find_corners, fit_camera, judge
+
+WIDTH, HEIGHT = 320, 240
+K = np.array([[270.0, 0, 161.5], [0, 268.0, 117.5], [0, 0, 1]])
+DISTORTION = np.array([-0.14, 0.05, 0.0003, 0.0005, 0.0])
+BOARD, SQUARE = Board(9, 6, 0.03), 0.03
+FINE = 4  # samples of a pixel, each way
+ARGS = ["--board", "9x6", "--square", "0.03"]
+
+
+@pytest.fixture(scope="module")
+def rays():
+    """[H, W, FINE², 2] where each sample of each pixel looks, in normalised coordinates."""
+    inside = (np.arange(FINE) + 0.5) / FINE - 0.5
+    x, y, dx, dy = np.meshgrid(
+        np.arange(WIDTH), np.arange(HEIGHT), inside, inside, indexing="ij", sparse=True
+    )
+    pixels = np.stack(np.broadcast_arrays(x + dx, y + dy), axis=-1).swapaxes(0, 1)
+    flat = cv2.undistortPoints(pixels.reshape(-1, 1, 2), K, DISTORTION)
+    return flat.reshape(HEIGHT, WIDTH, FINE**2, 2)
+
+
+def render(rays, board, rotation, middle, rng):
+    """A board with a white rim of half a square on a grey wall, its middle at `middle` metres."""
+    R = cv2.Rodrigues(np.asarray(rotation, float))[0]
+    centre = board.points.mean(0)
+    t = np.asarray(middle) - R @ centre
+    to_board = np.linalg.inv(np.stack([R[:, 0], R[:, 1], t], axis=1))
+    X, Y, W = np.moveaxis(rays @ to_board[:, :2].T + to_board[:, 2], -1, 0)
+    u, v = X / W / board.square, Y / W / board.square
+    columns, rows = board.columns, board.rows
+    dark = (np.floor(u) + np.floor(v)) % 2 == 0
+    square = (u > -1) & (u < columns) & (v > -1) & (v < rows)
+    rim = (u > -1.5) & (u < columns + 0.5) & (v > -1.5) & (v < rows + 0.5)
+    shade = np.where(square & dark, 30.0, np.where(rim, 220.0, 100.0)).mean(-1)
+    noisy = cv2.GaussianBlur(shade, (0, 0), 0.5) + rng.normal(0, 1.5, shade.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def poses(rng, count=14, tilt=0.5, depth=(0.5, 0.75)):
+    """Rotations and middles that reach all over the image."""
+    spots = [(i % 3 - 1, i // 3 % 3 - 1) for i in range(count)]
+    for x, y in spots:
+        z = rng.uniform(*depth)
+        middle = np.array([x * 0.24 * z + 0.01, y * 0.17 * z, z])
+        yield np.append(rng.uniform(-tilt, tilt, 2), rng.uniform(-0.2, 0.2)), middle
+
+
+def write(folder, images):
+    folder.mkdir(exist_ok=True)
+    for i, image in enumerate(images):
+        cv2.imwrite(str(folder / f"{i:02d}.png"), image)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def boards(rays, tmp_path_factory):
+    """14 views of the board; the last but one is cut off, the last has its rows out of line."""
+    rng = np.random.default_rng(5)
+    images = [render(rays, BOARD, *pose, rng) for pose in poses(rng)]
+    images[12] = render(rays, BOARD, (0.1, 0.2, 0.0), (0.3, 0.0, 0.6), rng)
+    bent = images[13].astype(np.float32)
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    bent = cv2.remap(bent, np.float32(x + 2 * np.sin(y / 15)), np.float32(y), cv2.INTER_LINEAR)
+    images[13] = bent.astype(np.uint8)
+    return write(tmp_path_factory.mktemp("boards") / "views", images)
+
+
+@pytest.fixture(scope="module")
+def done(boards, tmp_path_factory):
+    """The command's exit code and output folder, with the mount given."""
+    out = tmp_path_factory.mktemp("out") / "camera.yaml"
+    args = ["calibrate", "camera", str(boards), *ARGS, "-o", str(out)]
+    assert main([*args, "--mount", "height=0.6,pitch=0.26,x=0.05"]) == 0
+    return out
+
+
+def test_the_camera_comes_back(done):
+    found = read_camera(done)
+    fx, fy = np.diag(np.asarray(found.camera.K))[:2]
+    assert fx == pytest.approx(270, rel=0.003) and fy == pytest.approx(268, rel=0.003)
+    np.testing.assert_allclose(np.asarray(found.camera.K)[:2, 2], [161.5, 117.5], atol=1)
+    assert (found.camera.width, found.camera.height) == (WIDTH, HEIGHT)
+    corner = np.array([[[0.5, 0.4]]])  # what the lens does near the image's corner
+    seen = cv2.undistortPoints(corner * 270 + 160, K, DISTORTION, P=K)
+    again = cv2.undistortPoints(
+        corner * 270 + 160, np.asarray(found.camera.K, float), found.distortion, P=K
+    )
+    np.testing.assert_allclose(again, seen, atol=2)
+
+
+def test_the_mount_is_written_and_accepted(done):
+    mount = read_camera(done).mount
+    assert float(mount.height) == pytest.approx(0.6)
+    assert float(mount.pitch) == pytest.approx(0.26)
+    assert float(mount.x) == pytest.approx(0.05) and float(mount.y) == 0
+
+
+def test_it_says_which_views_were_left_out_and_why(boards, tmp_path, capfd):
+    assert main(["calibrate", "camera", str(boards), *ARGS, "-o", str(tmp_path / "c.yaml")]) == 0
+    out = capfd.readouterr().out
+    assert "12 of 14 images of 320x240 used" in out
+    lines = {line.split()[0]: line for line in out.splitlines() if ".png" in line}
+    assert "left out: no 9x6 corners found" in lines["12.png"]
+    assert "times the others' error" in lines["13.png"]
+    assert "left out" not in lines["00.png"] and " px " in lines["00.png"]
+    assert "verdict   good: the focal length is known to" in out
+    assert "fill in the height and the pitch" in out
+
+
+def test_corners_and_residuals_are_drawn(done):
+    image = cv2.imread(str(done.with_suffix(".png")))
+    assert min(image.shape[:2]) > 300 and image.std() > 5
+
+
+def test_without_matplotlib_there_is_no_figure(boards, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(viewer, "available", lambda: False)
+    assert main(["calibrate", "camera", str(boards), *ARGS, "-o", str(tmp_path / "c.yaml")]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["c.yaml"]
+    assert "sofjax[figures]" in capfd.readouterr().out
+
+
+def test_a_mount_that_is_not_measured_yet_is_asked_for(boards, tmp_path):
+    out = tmp_path / "camera.yaml"
+    images = [str(path) for path in sorted(boards.iterdir())[:8]]
+    args = ["calibrate", "camera", *images, *ARGS, "-o", str(out)]
+    assert main(args) == 0
+    with pytest.raises(InputError, match="fill in the metres from the floor to the lens"):
+        read_drive(tmp_path)
+    assert main([*args, "--mount", "height=0.6,y=-0.02"]) == 0
+    with pytest.raises(InputError, match="fill in the radians that the camera looks down"):
+        read_camera(out)
+    assert known_mount(out) == {"x": 0, "y": -0.02, "height": 0.6, "roll": 0, "yaw": 0}
+    out.write_text(out.read_text().replace("fill in the radians that the camera looks down", "0.3"))
+    assert main(args) == 0  # what the file has already is kept
+    mount = read_camera(out).mount
+    assert float(mount.pitch) == pytest.approx(0.3) and float(mount.y) == pytest.approx(-0.02)
+
+
+def test_another_board(rays):
+    rng = np.random.default_rng(2)
+    board = Board(7, 4, 0.05)
+    found = [
+        find_corners(render(rays, board, *pose, rng), board)
+        for pose in poses(rng, depth=(0.6, 0.9))
+    ]
+    found = [corners for corners in found if corners is not None]
+    assert len(found) >= 9
+    fit = fit_camera(board, WIDTH, HEIGHT, [str(i) for i in range(len(found))], found)
+    np.testing.assert_allclose(fit.intrinsics[:2], [270, 268], rtol=0.005)
+    np.testing.assert_allclose(fit.intrinsics[2:], [161.5, 117.5], atol=1)
+
+
+def test_the_refined_corners_are_those_of_the_board(rays):
+    rng = np.random.default_rng(0)
+    rotation, middle = np.array([0.3, -0.4, 0.1]), np.array([0.02, 0.01, 0.5])
+    t = middle - cv2.Rodrigues(rotation)[0] @ BOARD.points.mean(0)
+    true = cv2.projectPoints(BOARD.points, rotation, t, K, DISTORTION)[0].reshape(-1, 2)
+    found = find_corners(render(rays, BOARD, rotation, middle, rng), BOARD)
+    away = np.hypot(*(found[:, None] - true).transpose(2, 0, 1)).min(1)
+    assert np.sqrt(np.mean(away**2)) < 0.1
+
+
+def exact(rng, noise, **kind):
+    """Projected corners with noise, without any image."""
+    corners = []
+    for rotation, middle in poses(rng, **kind):
+        t = middle - cv2.Rodrigues(rotation)[0] @ BOARD.points.mean(0)
+        points = cv2.projectPoints(BOARD.points, rotation, t, K, DISTORTION)[0].reshape(-1, 2)
+        corners.append(points + rng.normal(0, noise, points.shape))
+    return corners
+
+
+def fitted(corners):
+    return fit_camera(BOARD, WIDTH, HEIGHT, [str(i) for i in range(len(corners))], corners)
+
+
+def test_the_standard_deviations_are_those_of_the_errors():
+    rng = np.random.default_rng(1)
+    fits = [fitted(exact(rng, 0.1)) for _ in range(20)]
+    z = [(fit.intrinsics - [270, 268, 161.5, 117.5]) / fit.intrinsics_sigma for fit in fits]
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
+
+
+def test_a_lens_without_k3_is_given_none():
+    fit = fitted(exact(np.random.default_rng(3), 0.05))
+    assert fit.distortion[4] == 0 and fit.distortion_sigma[4] == 0
+    np.testing.assert_allclose(fit.distortion[0], -0.14, atol=0.02)
+
+
+def test_views_that_are_all_alike_are_judged():
+    rng = np.random.default_rng(4)
+    flat = fitted(exact(rng, 0.2, tilt=0.02))
+    verdict = judge(flat)
+    assert verdict.word != "good" and any("never tilted" in reason for reason in verdict.reasons)
+    few = judge(fitted(exact(rng, 0.1, count=6, depth=(0.8, 0.9), tilt=0.3)))
+    assert any("6 views are few" in reason for reason in few.reasons)
+    assert any("the bottom left, bottom, bottom right" in reason for reason in few.reasons)
+
+
+def test_what_the_views_do_not_fix_is_not_written(rays, tmp_path, capfd):
+    rng = np.random.default_rng(6)
+    images = [
+        render(rays, BOARD, (0.0, 0.0, 0.02 * i), (0.0, 0.0, 0.6), rng) for i in range(6)
+    ]
+    folder, out = write(tmp_path / "views", images), tmp_path / "camera.yaml"
+    assert main(["calibrate", "camera", str(folder), *ARGS, "-o", str(out)]) == 3
+    said = capfd.readouterr().out
+    assert "not usable: " in said and "tilt" in said
+    assert f"{out} is not written" in said and not out.exists()
+
+
+@pytest.fixture
+def refused(boards, tmp_path, capfd):
+    """The sentence with which the command refuses."""
+
+    def call(*args, images=boards):
+        out = ["-o", str(tmp_path / "camera.yaml")] if "-o" not in args else []
+        images = [str(path) for path in images] if isinstance(images, list) else [str(images)]
+        assert main(["calibrate", "camera", *images, *map(str, args), *out]) == 2
+        _, err = capfd.readouterr()
+        assert "Traceback" not in err and err.startswith("sofjax: ") and err.count("\n") == 1
+        return err
+
+    return call
+
+
+@pytest.mark.parametrize(
+    "board, sentence",
+    [
+        ("6", "inner corners along and across, like 9x6"),
+        ("9x", "like 9x6"),
+        ("9x6x3", "like 9x6"),
+        ("-9x6", "like 9x6"),
+        ("9.0x6", "like 9x6"),
+        ("2x6", "from 3 to 60"),
+        ("900x6", "from 3 to 60"),
+        ("10x7", "with --board 9x6 they are found"),
+        ("4x13", "whole board must be in view"),
+    ],
+)
+def test_a_board_that_is_none(refused, boards, board, sentence):
+    two = [boards / "00.png", boards / "01.png"]
+    assert sentence in refused(f"--board={board}", "--square", 0.03, images=two)
+
+
+@pytest.mark.parametrize("square", ["0", "-0.03", "nan", "inf", "30"])
+def test_a_square_that_is_none(refused, square):
+    assert "in metres" in refused("--board", "9x6", f"--square={square}")
+
+
+@pytest.mark.parametrize(
+    "mount, sentence",
+    [
+        ("height", "must have the form height=0.6"),
+        ("", "must have the form"),
+        ("hight=0.6", "did you mean 'height'"),
+        ("height=-1", "greater than 0"),
+        ("height=nan", "finite"),
+        ("height=low", "must be a number"),
+        ("pitch=15", "radians"),
+        ("x=1,x=2", "given twice"),
+        ("height=0.6,pitch=-1.2", "above the horizon"),
+    ],
+)
+def test_a_mount_that_cannot_be(refused, mount, sentence, tmp_path):
+    assert sentence in refused(*ARGS, "--mount", mount)
+    assert not (tmp_path / "camera.yaml").exists()
+
+
+def test_a_part_of_a_mount():
+    assert mount_fields("--mount", "height = 0.6, yaw=-0.1") == {"height": 0.6, "yaw": -0.1}
+
+
+def test_images_that_are_none(refused, tmp_path):
+    assert "no such file or folder" in refused(*ARGS, images=tmp_path / "nowhere")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (empty / "notes.txt").write_text("no image")
+    assert "no image there" in refused(*ARGS, images=empty)
+    assert "no image there" in refused(*ARGS, images=empty / "notes.txt")
+    (empty / "broken.png").write_bytes(b"no image")
+    assert "none of the 1 images can be read" in refused(*ARGS, images=empty)
+    blank = write(tmp_path / "blank", [np.full((HEIGHT, WIDTH), 90, np.uint8)] * 6)
+    assert "found in 0 of 6 images, and 5 are needed" in refused(*ARGS, images=blank)
+
+
+def test_images_of_two_sizes(refused, boards, tmp_path):
+    large = cv2.resize(cv2.imread(str(boards / "00.png")), (640, 480))
+    cv2.imwrite(str(tmp_path / "large.png"), large)
+    sentence = refused(*ARGS, images=[boards, tmp_path / "large.png"])
+    assert "large.png: has 640x480 pixels and 00.png 320x240" in sentence
+
+
+def test_too_few_views(refused, boards):
+    some = [boards / f"{i:02d}.png" for i in range(3)]
+    assert "found in 3 of 3 images, and 5 are needed" in refused(*ARGS, images=some)
+
+
+def test_an_output_that_cannot_be_written(refused, tmp_path):
+    assert "is a folder" in refused(*ARGS, "-o", tmp_path)
+    (tmp_path / "file").write_text("")
+    assert "cannot be written" in refused(*ARGS, "-o", tmp_path / "file" / "camera.yaml")
+
+
+def test_an_output_that_is_another_file(refused, tmp_path):
+    notes = tmp_path / "notes.txt"
+    notes.write_text("my notes")
+    assert "must hold 'name: value' pairs" in refused(*ARGS, "-o", notes)
+    assert notes.read_text() == "my notes"
+
+
+def test_an_image_that_cannot_be_read_is_left_out(boards, tmp_path, capfd):
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"")
+    images = [str(path) for path in sorted(boards.iterdir())[:9]]
+    args = ["calibrate", "camera", *images, str(broken), *ARGS, "-o", str(tmp_path / "c.yaml")]
+    assert main(args) == 0
+    assert "broken.jpg           left out: cannot be read as an image" in capfd.readouterr().out
