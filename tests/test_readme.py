@@ -1,17 +1,23 @@
 """What the README says is so."""
 
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
+import equinox as eqx
+
 from sofjax import presets
+from sofjax.cli.main import _parser
 from sofjax.cli.settings import RunSettings
+from sofjax.io.camera_file import read_camera
 from sofjax.io.settings import to_dict
 from sofjax.vision import FrontendSettings
 
 ROOT = Path(__file__).parent.parent
+OFFICE = ROOT / "examples" / "office"
 README = (ROOT / "README.md").read_text()
 
 
@@ -33,6 +39,19 @@ def test_the_python_blocks_run_one_after_the_other():
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "lines" in done.stdout and "per metre" in done.stdout
+
+
+def test_the_commands_that_it_shows_are_understood():
+    for line in "".join(blocks("sh")).splitlines():
+        for command in re.findall(r"sofjax ([^;&]*)", line):
+            _parser().parse_args(shlex.split(command.replace("$seed", "1"), comments=True))
+
+
+def test_the_camera_file_that_it_shows_is_read(tmp_path):
+    (text,) = blocks("yaml")
+    (tmp_path / "camera.yaml").write_text(text)
+    shown, sample = (read_camera(folder / "camera.yaml") for folder in (tmp_path, OFFICE))
+    assert eqx.tree_equal(shown.mount, sample.mount)
 
 
 def test_what_it_links_to_and_names_is_there():
