@@ -26,7 +26,7 @@ class SensorModel(eqx.Module):
     rho_sigma: float = 0.02  # metres; the constant sigmas, and with `propagate` ...
     theta_sigma: float = 0.02  # radians; ... unused
     theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
-    adaptation: float = 0.3  # share of the surplus misfit by which the noise grows in a step
+    adaptation: float = 1.0  # share of the surplus misfit by which the noise grows in a step
     e_max: float = 9.0  # cost of an observed segment that matches nothing
 
 

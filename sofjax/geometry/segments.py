@@ -33,8 +33,10 @@ def overlap(first: Float[Array, "2 2"], second: Float[Array, "2 2"]) -> Float[Ar
     """
     d = second[1] - second[0]
     unit = safe_divide(d, safe_norm(d))
-    a, b = first @ unit, second @ unit
-    return jnp.minimum(a.max(), b.max()) - jnp.maximum(a.min(), b.min())
+    a0, a1 = first @ unit  # elementwise, as a reduction over two would not fuse over all pairs
+    b0, b1 = second @ unit
+    low = jnp.maximum(jnp.minimum(a0, a1), jnp.minimum(b0, b1))
+    return jnp.minimum(jnp.maximum(a0, a1), jnp.maximum(b0, b1)) - low
 
 
 def clip(

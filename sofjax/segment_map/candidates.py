@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sofjax.geometry.angles import wrap
 from sofjax.geometry.lines import PolarLine, polar_difference
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
-from sofjax.likelihood import Candidates, SensorModel, Sightings, mahalanobis
+from sofjax.likelihood import Candidates, SensorModel, Sightings
 from sofjax.segment_map.lines import MapRules, SegmentMap, appear, believed
 
 
@@ -35,12 +36,13 @@ def propose(
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
     tilting = sensor.tilt_sigma**2 * sightings.tilt @ jnp.swapaxes(sightings.tilt, 1, 2)
 
-    S = sightings.covariance[:, None] + spread + drift
-    S_tilt = S + tilting[:, None]
-    W_tilt = inverse_2x2(S_tilt)
+    # all M × K pairs, in numbers and not in 2×2 matrices: so they compile to one loop
+    near, far = sightings.covariance + tilting, spread + drift
+    s = lambda i, j: near[:, None, i, j] + far[:, i, j]
     observed = PolarLine(sightings.line.rho[:, None], sightings.line.theta[:, None])
-    difference = polar_difference(observed, lines)
-    error = mahalanobis(difference, W_tilt)
+    d_rho, d_theta = jnp.moveaxis(polar_difference(observed, lines), -1, 0)
+    error = s(1, 1) * d_rho**2 - 2 * s(0, 1) * d_rho * d_theta + s(0, 0) * d_theta**2
+    error = error / (s(0, 0) * s(1, 1) - s(0, 1) ** 2)
 
     # apparent extents: a raised line is seen magnified about the foot
     extent = (
@@ -49,14 +51,17 @@ def propose(
     share = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))(
         extent, sightings.endpoints_foot
     )
-    error = jnp.where(segment_map.valid & (share > -rules.join_gap), error, jnp.inf)
+    possible = segment_map.valid & (share > -rules.join_gap)
+    if rules.directed:
+        possible = possible & (jnp.abs(wrap(observed.theta - lines.theta)) < jnp.pi / 2)
+    error = jnp.where(possible, error, jnp.inf)
     best, slot = jax.lax.top_k(-error, rules.candidates)
-    rows = jnp.arange(error.shape[0])[:, None]
+    S = sightings.covariance[:, None] + far[slot]
     candidates = Candidates(
         line=PolarLine(lines.rho[slot], lines.theta[slot]),
         kappa=seen[slot, 2],
-        precision=inverse_2x2(S[rows, slot]),
-        precision_tilt=W_tilt[rows, slot],
+        precision=inverse_2x2(S),
+        precision_tilt=inverse_2x2(S + tilting[:, None]),
         valid=jnp.isfinite(best),
     )
     return candidates, slot, -best[:, 0]

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sofjax.geometry.angles import safe_norm, safe_sqrt, wrap_axial
+from sofjax.geometry.angles import safe_norm, safe_sqrt, wrap, wrap_axial
 from sofjax.geometry.lines import PolarLine, direction, normal, polar_difference, polar_through
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
@@ -201,14 +201,14 @@ def _merge(rules, m, slot, known):
     n = normal(line)
     raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
 
-    offset = jnp.einsum("mij,kj->mki", ends[at], n) - line.rho[:, None]
-    turn = wrap_axial(line.theta[at][:, None] - line.theta)
+    first, second = jnp.einsum("mij,kj->imk", ends[at], n) - line.rho
+    turn = (wrap if rules.directed else wrap_axial)(line.theta[at][:, None] - line.theta)
     gap = -jax.vmap(jax.vmap(overlap, in_axes=(None, 0)), in_axes=(0, None))(ends[at], ends)
     older = (m.updates > m.updates[at][:, None]) | (
         (m.updates == m.updates[at][:, None]) & (jnp.arange(K) < at[:, None])
     )
     double = (
-        (jnp.abs(offset).max(axis=-1) < rules.merge_distance)
+        (jnp.maximum(jnp.abs(first), jnp.abs(second)) < rules.merge_distance)
         & (jnp.abs(turn) < rules.merge_angle)
         & (gap < rules.join_gap)
         & (raised == raised[at][:, None])

@@ -18,7 +18,8 @@ class MapRules(eqx.Module):
 
     rule: str = eqx.field(static=True, default="kalman")  # or "gamma", eq. (14)
     classify: bool = eqx.field(static=True, default=True)  # estimate kappa, tell floor from above
-    capacity: int = eqx.field(static=True, default=512)  # K
+    directed: bool = eqx.field(static=True, default=False)  # tell a line's edges apart
+    capacity: int = eqx.field(static=True, default=1024)  # K
     candidates: int = eqx.field(static=True, default=4)  # C, map lines compared per sighting
     range: float = 5.0  # R, metres: what is farther does not extend a segment
     length: float = 10.0  # L = 2 R, metres: a longer segment rests
