@@ -95,11 +95,11 @@ def run(args: argparse.Namespace) -> int:
     if not verdict.usable:
         print(f"{args.out} is not written")
         return REFUSED
-    _write(args.out, _folder_name(args.images[0]), board, fit, mount)
+    _write(args.out, board, fit, mount)
     return 0
 
 
-def _write(path: Path, name: str, board: "Board", fit: "CameraFit", mount: dict) -> None:
+def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict) -> None:
     """The camera file, and what it still wants."""
     import jax.numpy as jnp
 
@@ -113,6 +113,7 @@ def _write(path: Path, name: str, board: "Board", fit: "CameraFit", mount: dict)
     views = sum(view.used for view in fit.views)
     notes = [f"from {views} views of a {board} board", *numbers(fit)]
     distortion = fit.distortion.round(7)
+    name = path.resolve().parent.name  # as a camera without a name is called
     write_intrinsics(path, camera, "plumb_bob", distortion, name, mount, notes)
     print(f"written to {path}")
     if missing:
@@ -262,11 +263,6 @@ def _board(text: str, square: float) -> "Board":
             f"--square is {square:g}; it must be the side of a square in metres, such as 0.03"
         )
     return Board(columns, rows, square)
-
-
-def _folder_name(path: Path) -> str:
-    path = path.resolve()
-    return (path if path.is_dir() else path.parent).name
 
 
 def _by(shape: tuple[int, int]) -> str:
