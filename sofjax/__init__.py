@@ -18,6 +18,13 @@ _HOME = {  # in reading order
     "image_to_floor": "sofjax.geometry",
     "floor_to_image": "sofjax.geometry",
     "two_view_homography": "sofjax.geometry",
+    # many hypotheses at once
+    "homographies": "sofjax.batch",
+    "transferred_lines": "sofjax.batch",
+    "association_scores": "sofjax.batch",
+    "log_likelihood": "sofjax.batch",
+    "log_likelihood_pruned": "sofjax.batch",
+    "image_log_likelihood": "sofjax.batch",
     # segments on the floor: eq. (9), Figs. 5 and 6
     "Observation": "sofjax.observation",
     "Association": "sofjax.association",
@@ -29,7 +36,18 @@ _HOME = {  # in reading order
     "PRESETS": "sofjax.presets",
 }
 _MODULES = ("geometry", "association", "sof", "motion", "likelihood", "particles", "segment_map")
-_MODULES += ("slam", "presets", "observation", "evaluation", "io", "vision", "simulation", "viewer")
+_MODULES += (
+    "slam",
+    "presets",
+    "batch",
+    "smoothing",
+    "observation",
+    "evaluation",
+    "io",
+    "vision",
+    "simulation",
+    "viewer",
+)
 
 __all__ = [*_HOME, *_MODULES]
 

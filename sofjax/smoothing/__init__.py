@@ -1,0 +1,18 @@
+"""All poses, all segments, the odometer's errors and, if asked, the mount at once.
+
+Least squares by optimistix over the keyframes of a drive. The residuals are distances in pixels of
+the end points of each observed segment from its map line, transferred into the image, and the
+odometer's readings with their covariance. What makes it fast is the arrow shape of the problem: an
+observation ties one pose to one line, the odometer one pose to the next. The poses are eliminated
+by a block-tridiagonal sweep, and a dense system of the lines and of what all share remains.
+
+This is the solve alone, for associations that are given: no command uses it yet.
+"""
+
+from sofjax.smoothing.problem import Keyframes as Keyframes
+from sofjax.smoothing.problem import Priors as Priors
+from sofjax.smoothing.problem import Problem as Problem
+from sofjax.smoothing.problem import Unknowns as Unknowns
+from sofjax.smoothing.problem import residuals as residuals
+from sofjax.smoothing.solution import Solution as Solution
+from sofjax.smoothing.solution import solve as solve
