@@ -1,5 +1,7 @@
 """Strict JAX for every test: no silent promotion of types, and float64 where a test asks for it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +22,10 @@ def x64():
 @pytest.fixture
 def rng():
     return np.random.default_rng(20240)
+
+
+# for what runs once or twice: most of a test's time is the compiler's
+jit_quickly = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def as_float32(tree):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from conftest import jit_quickly
 
 from sofjax.geometry import (
     SE2,
@@ -22,6 +23,13 @@ from sofjax.geometry.floor import horizon
 
 pytestmark = pytest.mark.usefixtures("x64")
 DEPTH = 8.0
+to_image = jit_quickly(jax.vmap(floor_to_image, (None, 0)))
+from_image = jit_quickly(jax.vmap(image_to_floor, (None, 0)))
+
+
+@jit_quickly
+def segments_to_floor(H_F, segments, max_depth):
+    return jax.vmap(segment_to_floor, (None, 0, None))(H_F, segments, jnp.asarray(max_depth, float))
 
 
 def pose(x, y, yaw):
@@ -29,7 +37,8 @@ def pose(x, y, yaw):
 
 
 def to_floor(H_F, segment, max_depth=DEPTH):
-    return segment_to_floor(H_F, jnp.asarray(segment, float), jnp.asarray(max_depth))
+    found, some = segments_to_floor(H_F, jnp.asarray([segment], float), max_depth)
+    return found[0], some[0]
 
 
 @pytest.fixture
@@ -73,8 +82,8 @@ def test_floor_to_image_and_back_is_the_same_point(camera, mounts, rng):
     for mount in mounts:
         H_F = floor_homography(camera, mount, pose(*rng.normal(size=3)))
         points = jnp.asarray(rng.normal(size=(50, 2)) * 4)
-        pixels, ahead = jax.vmap(floor_to_image, (None, 0))(H_F, points)
-        back, visible = jax.vmap(image_to_floor, (None, 0))(H_F, pixels)
+        pixels, ahead = to_image(H_F, points)
+        back, visible = from_image(H_F, pixels)
         assert ahead.any() and not ahead.all()
         assert visible[ahead].all()
         np.testing.assert_allclose(back[ahead], points[ahead], atol=1e-8)
@@ -86,7 +95,7 @@ def test_a_pixel_sees_the_floor_where_its_ray_points_down_and_nowhere_else(camer
         where = rng.normal(size=3)
         H_F = floor_homography(camera, mount, pose(*where))
         pixels = rng.uniform(0, 320, size=(60, 2))
-        points, visible = jax.vmap(image_to_floor, (None, 0))(H_F, jnp.asarray(pixels))
+        points, visible = from_image(H_F, jnp.asarray(pixels))
         assert np.isfinite(points).all()
         for pixel, point, sees in zip(pixels, points, visible, strict=True):
             expected, down = reference.back_project(camera.K, mount, where, pixel)
@@ -121,36 +130,33 @@ def test_the_horizon_line_says_one_over_depth(camera, mount):
 def test_a_segment_in_range_goes_by_its_end_points(camera, mounts, rng):
     for mount in mounts:
         H_F = floor_homography(camera, mount, pose(*rng.normal(size=3)))
-        points = jnp.asarray(rng.normal(size=(40, 2, 2)) * 3)
-        depth = points @ H_F[2, :2] + H_F[2, 2]
-        points = points[((depth > 0.1) & (depth < DEPTH)).all(axis=1)]
-        pixels, _ = jax.vmap(jax.vmap(floor_to_image, (None, 0)), (None, 0))(H_F, points)
-        for segment, expected in zip(pixels, points, strict=True):
-            found, some = to_floor(H_F, segment)
-            assert some
-            np.testing.assert_allclose(found, expected, atol=1e-9)
+        points = rng.normal(size=(40, 2, 2)) * 3
+        x = np.concatenate([points, np.ones((40, 2, 1))], axis=2) @ np.asarray(H_F).T
+        in_range = ((x[..., 2] > 0.1) & (x[..., 2] < DEPTH)).all(axis=1)
+        found, some = segments_to_floor(H_F, jnp.asarray(x[..., :2] / x[..., 2:]), DEPTH)
+        assert in_range.any() and some[in_range].all()
+        np.testing.assert_allclose(found[in_range], points[in_range], atol=1e-9)
 
 
 def test_a_clipped_end_lies_on_the_line_at_the_greatest_depth(camera, mounts, rng):
     clipped = 0
     for mount in mounts:
-        H_F = floor_homography(camera, mount, SE2.identity())
-        for segment in rng.uniform([0, 0], [320, 240], size=(40, 2, 2)):
-            inverse_depth = segment @ horizon(H_F)[:2] + horizon(H_F)[2]
-            inside = np.asarray(inverse_depth > 1 / DEPTH)
-            found, some = to_floor(H_F, segment)
-            assert bool(some) == inside.any()
-            assert np.isfinite(found).all()
-            if inside.sum() != 1:
+        H_F = np.asarray(floor_homography(camera, mount, SE2.identity()))
+        segments = rng.uniform([0, 0], [320, 240], size=(40, 2, 2))
+        inside = segments @ np.linalg.inv(H_F)[2, :2] + np.linalg.inv(H_F)[2, 2] > 1 / DEPTH
+        found, some = segments_to_floor(jnp.asarray(H_F), jnp.asarray(segments), DEPTH)
+        np.testing.assert_array_equal(some, inside.any(axis=1))
+        assert np.isfinite(found).all()
+        for segment, ends, within in zip(segments, np.asarray(found), inside, strict=True):
+            if within.sum() != 1:
                 continue
             clipped += 1
-            kept, cut = (0, 1) if inside[0] else (1, 0)
-            whole, _ = image_to_floor(H_F, jnp.asarray(segment[kept]))
-            np.testing.assert_allclose(found[kept], whole, atol=1e-9)
-            np.testing.assert_allclose(H_F[2] @ jnp.append(found[cut], 1.0), DEPTH, rtol=1e-9)
-            L = line_to_floor(H_F, line_through(*jnp.asarray(segment)))
-            distance = L @ jnp.append(found[cut], 1.0) / jnp.linalg.norm(L[:2])
-            assert abs(distance) < 1e-8
+            kept, cut = (0, 1) if within[0] else (1, 0)
+            whole, _ = reference.back_project(camera.K, mount, (0, 0, 0), segment[kept])
+            np.testing.assert_allclose(ends[kept], whole, atol=1e-7)
+            np.testing.assert_allclose(H_F[2] @ [*ends[cut], 1], DEPTH, rtol=1e-9)
+            L = H_F.T @ reference.line_through(*segment)
+            assert abs(L @ [*ends[cut], 1]) < 1e-8 * np.linalg.norm(L[:2])
     assert clipped > 20
 
 
@@ -241,7 +247,7 @@ def test_an_upright_line_meets_the_floor_where_its_two_floor_lines_cross(camera,
 def test_float32_is_good_to_a_millimetre_at_five_metres(camera, mount, rng):
     H_F = floor_homography(camera, mount, SE2.identity())
     points = jnp.asarray(rng.uniform([0.5, -2], [5, 2], size=(100, 2)))
-    pixels, _ = jax.vmap(floor_to_image, (None, 0))(H_F, points)
+    pixels, _ = to_image(H_F, points)
     with jax.enable_x64(False):
         back, _ = jax.vmap(image_to_floor, (None, 0))(
             H_F.astype("float32"), pixels.astype("float32")

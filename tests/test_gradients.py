@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from conftest import make_camera
+from conftest import jit_quickly, make_camera
 
 from sofjax.association import Association, association_error
 from sofjax.geometry import (
@@ -69,7 +69,7 @@ def derivatives(function):
     def everything(x, about):
         return jax.vmap(f)(about), f(x), jax.jacfwd(f)(x), jax.jacrev(f)(x)
 
-    return jax.jit(everything, compiler_options={"xla_backend_optimization_level": 0})
+    return jit_quickly(everything)
 
 
 def differentiate(function, at):
@@ -426,13 +426,13 @@ def test_what_is_masked_has_no_gradient(masks):
 def test_gradients_with_some_segments_masked_are_those_of_the_others():
     segments = Segments(jnp.asarray(SEGMENTS), jnp.ones(4, bool))
     sensor = SensorModel(tilt_sigma=0.002)
-    found = jax.jit(sight)(sensor, make_camera(), mount_of(MOUNT), segments, 8.0)
+    found = jit_quickly(sight)(sensor, make_camera(), mount_of(MOUNT), segments, 8.0)
     W = 900 * jnp.broadcast_to(jnp.eye(2), (4, 1, 2, 2))
     line = PolarLine(found.line.rho[:, None] + 0.01, found.line.theta[:, None] - 0.005)
     lines = Candidates(line, jnp.ones((4, 1)), W, W, jnp.ones((4, 1), bool))
     keep = np.array([0, 2])
 
-    @jax.jit
+    @jit_quickly
     @jax.grad
     def gradient(p, sightings, lines, used):
         return compare(sensor, sightings, lines, pose_of(p), used).log_likelihood

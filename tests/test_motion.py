@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import jit_quickly
 
 from sofjax.geometry import SE2
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, sample_motions
@@ -13,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 UNBIASED = MotionModel(distance_scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma=0.0)
 LOUD = MotionModel(distance_noise=0.03, lateral_noise=0.01, heading_noise=0.02, turn_noise=0.05)
 N = 20_000
-sample_all, sample_one = jax.jit(sample_motions), jax.jit(sample_motion)
+sample_all, sample_one = jit_quickly(sample_motions), jit_quickly(sample_motion)
 
 
 def reading(*twist):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from conftest import jit_quickly
 
 from sofjax.association import Association, association_error
 from sofjax.geometry import (
@@ -245,7 +246,7 @@ def test_fig_5_finds_the_floor_s_segments_of_two_images(camera, forward):
         )
         for x in (0.0, 0.8)
     )
-    found = extract(Association(gate=2.0), camera, forward, first, second, robot(0.8))
+    found = jit_quickly(extract)(Association(gate=2.0), camera, forward, first, second, robot(0.8))
     np.testing.assert_array_equal(found.is_floor, [True, False, False])
     np.testing.assert_allclose(found.segments_robot.endpoints[0], [[2.2, -1], [2.2, 1]], atol=1e-9)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from conftest import jit_quickly
 
 from sofjax.geometry import SE2, Mount, PolarLine, Segments
 from sofjax.geometry.lines import polar_through
@@ -30,7 +31,7 @@ K, M = 8, 4
 KALMAN = MapRules(capacity=K, rho_drift=0.0, theta_drift=0.0)
 GAMMA = dataclasses.replace(KALMAN, rule="gamma", classify=False)
 STIFF = SensorModel(tilt_sigma=0.0)
-grow, proposals = jax.jit(integrate), jax.jit(propose)
+grow, proposals = jit_quickly(integrate), jit_quickly(propose)
 
 
 def pose(x=0.0, y=0.0, yaw=0.0):

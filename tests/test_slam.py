@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from conftest import make_camera
+from conftest import jit_quickly, make_camera
 
 from sofjax import slam
 from sofjax.geometry import SE2, Mount, Segments
@@ -33,9 +33,8 @@ CONFIG = with_sizes(DEFAULT)
 MOUNT = Mount.create(height=0.6, pitch=0.2618, x=0.05)
 CAMERA = make_camera()
 
-compiled = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 # one trace for all the images, keys and numbers of every test below
-step = compiled(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
+step = jit_quickly(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
 
 
 def tiles():
@@ -164,7 +163,7 @@ def test_a_scan_is_one_step_after_the_other():
             jax.tree.map, lambda a: a.astype(float) if a.dtype == "float32" else a
         )
         camera, mount, observations = as_float64((CAMERA, MOUNT, drive()[1]))
-        one_step, scan = (compiled(f.__wrapped__) for f in (slam.step, slam.run))
+        one_step, scan = (jit_quickly(f.__wrapped__) for f in (slam.step, slam.run))
         one = state = slam.init(CONFIG, camera, mount, jax.random.key(0), M)
         scanned_state, scanned = scan(CONFIG, camera, mount, state, observations)
         for i in range(T):
@@ -317,7 +316,7 @@ def test_the_weights_stay_normalised():
 
 def test_the_paper_s_settings_run_with_a_single_winner():
     config = with_sizes(PAPER)
-    paper = compiled(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
+    paper = jit_quickly(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
     state, errors = start(config), []
     for i in range(T):
         state, info = paper(config, CAMERA, MOUNT, state, frame(i))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from conftest import jit_quickly
 
 from sofjax.association import Association
 from sofjax.geometry import SE2, Mount, Segments
@@ -16,7 +17,7 @@ TILES = [[[x, -0.6], [x, 0.6]] for x in (1.4, 1.9, 2.5)] + [
     [[1.2, y], [3, y]] for y in (-0.7, 0.3, 0.9)
 ]
 CONFIG = Association(gate=2.0)
-sof = jax.jit(extract)
+sof = jit_quickly(extract)
 
 
 def at_height(z):
@@ -67,11 +68,10 @@ def test_extract_for_many_poses_is_the_loop_over_poses(camera, mount, rng):
     def of_pose(T):
         return extract(CONFIG, camera, mount, first, second, T)
 
-    batch = jax.jit(jax.vmap(of_pose))(many)
+    batch = jit_quickly(jax.vmap(of_pose))(many)
     assert 0 < batch.is_floor.sum() < batch.is_floor.size
-    one = jax.jit(of_pose)
     for i in range(12):
-        alone = one(pose(*xy[i], yaw[i]))
+        alone = sof(CONFIG, camera, mount, first, second, pose(*xy[i], yaw[i]))
         np.testing.assert_array_equal(batch.is_floor[i], alone.is_floor)
         np.testing.assert_array_equal(batch.matches.partner[i], alone.matches.partner)
         np.testing.assert_allclose(
