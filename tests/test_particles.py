@@ -59,6 +59,13 @@ def test_resampling_is_a_comb_on_the_cumulative_weights(rng):
         np.testing.assert_array_equal(systematic(key, log(*weights)), expected)
 
 
+def test_the_scale_of_the_weights_does_not_matter():
+    for key in KEYS[:5]:
+        for shift in (-3.0, 0.0, 5.0):
+            drawn = systematic(key, log(1, 2, 3, 2) + shift)
+            np.testing.assert_array_equal(drawn, systematic(key, log(1, 2, 3, 2)))
+
+
 def test_resampling_is_unbiased():
     weights = np.array([0.5, 0.3, 0.15, 0.05])
     drawn = jax.vmap(systematic, (0, None))(

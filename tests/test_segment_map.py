@@ -322,9 +322,21 @@ def test_lines_apart_stay_two(second):
 
 def test_lines_that_cross_stay_two():
     m = seen(empty_map(GAMMA), across(1.0, -0.05, 0.05))
+    for _ in range(2):
+        m = seen(m, across(1.0, -0.05, 0.05), slots=[0])
     crossing = [[-0.05, 0.995], [0.05, 1.005]]  # within a centimetre, but turned by 0.1
     m = seen(seen(m, crossing), crossing, slots=[1])
     assert m.valid.sum() == 2
+
+
+def test_a_raised_line_does_not_join_the_floor_line_below_it():
+    m, ends = doubled(KALMAN)
+    raised = dataclasses.replace(
+        m,
+        line=m.line.at[0, 2].set(1.2),
+        covariance=m.covariance.at[0, 2].set(0).at[0, :, 2].set(0).at[0, 2, 2].set(1e-4),
+    )
+    assert seen(raised, ends, slots=[1], rules=KALMAN).valid.sum() == 2
 
 
 def test_the_older_line_does_not_join_the_younger():
@@ -410,6 +422,14 @@ def test_the_height_of_a_line_is_found_from_all_its_views(z):
     assert bool(is_raised(KALMAN, m.line[0], m.covariance[0])) == (z != 0)
     # and the segment lies where the line is, not where it appears from anywhere
     np.testing.assert_allclose(ends_of(m)[:, 1], 1.0, atol=2e-3)
+
+
+def test_a_raised_line_grows_to_where_it_ends_and_not_to_where_it_appears_to():
+    m, T = drive_past(0.1), pose(*PATH[-1])
+    apparent = raised_view(T, 1.0, 0.1, 1.0, 4.2)
+    m = seen(m, apparent, at=T, slots=[0], rules=KALMAN, sigma=0.005)
+    assert T.apply(jnp.asarray(apparent))[1, 0] > 4.8
+    assert ends_of(m)[:, 0].max() == pytest.approx(4.2, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -625,6 +645,9 @@ def test_what_is_in_view_worked_by_hand(camera):
     )
     shown = functools.partial(in_view, KALMAN, camera, level)
     np.testing.assert_array_equal(shown(m, pose())[: len(middles)], expected)
+    # a line over the floor appears farther away
+    high = dataclasses.replace(m, line=m.line.at[1, 2].set(1.5))
+    assert shown(high, pose())[1]
     # the same from elsewhere, turned
     T = pose(2, -1, 2.0)
     there = Segments(T.apply(m.segments_world.endpoints), m.valid)

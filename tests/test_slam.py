@@ -209,6 +209,23 @@ def test_the_first_image_begins_no_lines_and_a_baseline_later_some_are_known():
     assert info.matched[6:].min() > 0
 
 
+@pytest.mark.parametrize("used", ["recent", "reference"])
+def test_an_image_is_compared_with_the_last_view_a_baseline_away(used):
+    """The recent one if it is far enough, else the one before; here the other one is black."""
+    state, info = stepped(map(frame, range(12)))
+
+    def view(i, segments):
+        return slam.View(segments, SE2(info.T_world_robot.xy[i], info.T_world_robot.yaw[i]))
+
+    nothing = black(SE2.identity()).segments_image
+    views = {
+        "recent": {"recent": view(7, frame(7).segments_image), "reference": view(0, nothing)},
+        "reference": {"recent": view(11, nothing), "reference": view(7, frame(7).segments_image)},
+    }
+    _, after = stepped([frame(12)], state=dataclasses.replace(state, **views[used]))
+    assert after.associated[0] > 3
+
+
 def test_the_funnel_narrows():
     _, info = default_run()
     np.testing.assert_array_equal(info.detected, drive()[1].segments_image.valid.sum(axis=1))

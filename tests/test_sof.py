@@ -54,6 +54,14 @@ def test_the_same_lines_over_the_floor_are_not_found(camera, mount):
     assert not found.is_floor[:3].any()
 
 
+def test_a_pair_of_the_floor_that_is_too_far_away_is_not_used(camera, mount):
+    first, second = (view(camera, mount, (x, 0, 0), TILES) for x in (0, 0.4))
+    found = sof(CONFIG, camera, mount, first, second, pose(0.4, 0, 0), 1.8)
+    assert found.matches.matched.sum() == len(TILES)
+    assert 0 < found.is_floor.sum() < len(TILES)
+    np.testing.assert_array_equal(found.is_floor, found.segments_robot.valid)
+
+
 def test_a_wrong_motion_finds_none(camera, mount):
     first, second = (view(camera, mount, p, TILES) for p in ((0, 0, 0), (0.4, 0, 0)))
     found = sof(Association(gate=1.0), camera, mount, first, second, pose(0.4, 0, 0.2))
