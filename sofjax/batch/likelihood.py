@@ -64,12 +64,11 @@ def log_likelihood(
 
     **Returns:** log L of each particle, without constants.
     """
-    values, exact = _log_likelihood(
+    return _log_likelihood(
         particles, observed, segment_map,
         *_scalars(particles, sigma_rho, sigma_theta, e_max, overlap_scale),
         used, covariance, soft=soft, prune=prune, fall_back=True,
-    )  # fmt: skip
-    return values
+    )[0]  # fmt: skip
 
 
 def log_likelihood_pruned(
@@ -186,9 +185,9 @@ def _pair_by_pair(cloud, seen, lines, e_max, counts, needed):
     take = lambda tree, i: jax.tree.map(lambda leaf: leaf[i], tree)
 
     def over_map(m):
-        nearest = lambda k, best: jnp.minimum(best, _every_error(cloud, take(seen, m), take(lines, k)))
-        start = jnp.full_like(cloud.x, e_max)
-        return lax.fori_loop(0, len(lines.rho), nearest, start)
+        error = lambda k: _every_error(cloud, take(seen, m), take(lines, k))
+        nearest = lambda k, best: jnp.minimum(best, error(k))
+        return lax.fori_loop(0, len(lines.rho), nearest, jnp.full_like(cloud.x, e_max))
 
     add = lambda m, total: total - 0.5 * counts[m] * over_map(m)
     return lax.fori_loop(0, jnp.where(needed, len(seen.rho), 0), add, jnp.zeros_like(cloud.x))

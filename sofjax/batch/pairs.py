@@ -88,9 +88,8 @@ def prepare(
 
     theta, along, across, length, unit = _line(_without_padding(observed))
     turned = SE2(jnp.zeros_like(middle), heading).rotate(unit)
-    rho_variance, mixed, theta_variance = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    given_theta = rho_variance - mixed**2 / theta_variance
-    a = 1 / safe_sqrt(given_theta)
+    mixed, theta_variance = covariance[:, 0, 1], covariance[:, 1, 1]
+    a = 1 / safe_sqrt(covariance[:, 0, 0] - mixed**2 / theta_variance)  # of rho, theta given
     seen = Seen(
         wrap(theta + heading), across, turned[:, 0], turned[:, 1], along, length / 2,
         a, -a * mixed / theta_variance, 1 / safe_sqrt(theta_variance), length > 0,

@@ -103,9 +103,8 @@ def reach(
     room = -(-2 * K // size) * size
     rank = jnp.cumsum(listed, axis=1)
     slot = jnp.where(listed, rank - 1, room)
-    index = jnp.full((M, room), 3 * K).at[jnp.arange(M)[:, None], slot].set(
-        jnp.arange(3 * K), mode="drop"
-    )
+    none = jnp.full((M, room), 3 * K)
+    index = none.at[jnp.arange(M)[:, None], slot].set(jnp.arange(3 * K), mode="drop")
     return Reach(_with_none(live), index.reshape(M, -1, size), rank[:, -1], centre, turn, side)
 
 
@@ -148,7 +147,7 @@ def _with_none(table: Float[Array, "R 8"]) -> Float[Array, "R_plus_1 8"]:
 
 def _seam(lines: Lines, cut: Float[Array, ""]) -> Float[Array, ""]:
     """The direction in [-pi/2, pi/2) that the fewest map segments are near to."""
-    seams = jnp.arange(SEAMS) * (np.pi / SEAMS) - np.pi / 2
+    seams = jnp.linspace(-np.pi / 2, np.pi / 2, SEAMS, endpoint=False, dtype=lines.theta.dtype)
     turn = lines.theta - seams[:, None]
     near = (jnp.abs(turn - jnp.pi * jnp.round(turn / jnp.pi)) < cut) & lines.matchable
     return seams[near.sum(axis=1).argmin()]

@@ -39,7 +39,7 @@ def row(
     seen: Seen,
     near: Reach,
     m: Int[Array, ""],
-    scale: float,
+    scale: Float[Array, ""] | float,
     diagonal: bool,
 ) -> Row:
     """Observed segment m for all particles; a dozen operations for each of them."""

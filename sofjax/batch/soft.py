@@ -11,6 +11,7 @@ by the map take a loop of their own.
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from sofjax.batch.pairs import Cloud, Lines, Seen, compare_pairs
-from sofjax.batch.reach import Reach, reach
+from sofjax.batch.reach import reach
 from sofjax.batch.rows import gaps, over_groups, over_observed, row, whitened
 
 NEGLIGIBLE = 28.0  # in e: a pair this far beyond e_max adds less than a millionth to the sum
@@ -85,8 +86,8 @@ def _dense(tangent):
 
 
 def _one_pass(diagonal, prune, cloud, seen, lines, e_max, tau, counts, wanted):
-    """Value, derivative by e_max, by the pose (x, y, yaw) [N] and by the fields of `seen` [M, N]."""
-    e_cut = e_max + NEGLIGIBLE + 2 * np.log(max(len(lines.rho), 1))
+    """Value, and its derivatives by e_max and the pose [N], by the fields of `seen` [M, N]."""
+    e_cut = e_max + NEGLIGIBLE + 2 * math.log(max(len(lines.rho), 1))
     near = reach(cloud, seen, lines, e_cut, tau * jnp.sqrt(e_cut), prune, diagonal)
     trigonometry = jnp.cos(cloud.yaw), jnp.sin(cloud.yaw)
     zero = jnp.zeros_like(cloud.x)
@@ -102,8 +103,9 @@ def _one_pass(diagonal, prune, cloud, seen, lines, e_max, tau, counts, wanted):
     def one(carry, m):
         value, by_e_max, by_pose, by_seen = carry
         r = row(cloud, trigonometry, seen, near, m, 1 / tau, diagonal)
-        start = {name: zero for name in sums}
-        s = over_groups(near, m, start, lambda total, group: _add(total, group, r, e_max))
+        start = _pair_up({name: zero for name in sums})
+        add = lambda total, group: _pair_up(_add(_apart(total), group, r, e_max))
+        s = _apart(over_groups(near, m, start, add))
         u = s.pop("u")
         share = counts[m] / (1 + u)
         s = {name: share * total for name, total in s.items()}
@@ -141,54 +143,59 @@ def _one_pass(diagonal, prune, cloud, seen, lines, e_max, tau, counts, wanted):
 
 
 def _add(total, group, r, e_max):
-    """The sums over k, with one group of map segments added.
-
-    Every u is used by several sums and so is worked out once; the rest is cheap enough to be
-    worked out again for each.
-    """
+    """The sums over k that are in `total`, with one group of map segments added."""
     right = r.c * (np.pi / 2)
+    across = r.dy * r.x - r.dx * r.y
+    b = 0.0 if r.b is None else r.b
+    a = 1.0 if r.b is None else r.a  # the table has it already
 
     def terms(line):
+        """u, and u times half the derivatives of -(e + (gap / tau)²) and what makes them up."""
         z_rho, z_theta = whitened(r, line)
-        past, before = gaps(r, line)
-        return z_rho, z_theta, jnp.where(past > 0, past, 0), jnp.where(before > 0, before, 0)
-
-    def weight(line):
-        z_rho, z_theta, past, before = terms(line)
-        gap = past + before  # one of them is zero
+        past, before = (jnp.where(gap > 0, gap, 0) for gap in gaps(r, line))  # one of them is 0
+        gap = past + before
         u = jnp.exp(0.5 * (e_max - z_rho * z_rho - z_theta * z_theta - gap * gap))
-        return jnp.where(jnp.abs(z_theta) < right, u, 0)
-
-    def turned(line, past, before):
-        """Half the derivative of -(gap / tau)² as the observed segment turns about the robot."""
+        u = jnp.where(jnp.abs(z_theta) < right, u, 0)
         x1, y1, x2, y2 = line[4:]
-        first = r.dy * (x1 - r.x) - r.dx * (y1 - r.y)
-        second = r.dy * (x2 - r.x) - r.dx * (y2 - r.y)
-        return past * first - before * second
-
-    total = dict(total)
-    for line in group:
-        z_rho, z_theta, past, before = terms(line)
-        u, b = weight(line), 0.0 if r.b is None else r.b
-        a = 1.0 if r.b is None else r.a  # or in the table already
-        of = {
-            "u": lambda: u,
-            "x": lambda: u * z_rho * (a * line[2]),
-            "y": lambda: u * z_rho * (a * line[3]),
-            "theta": lambda: u * (b * z_rho + r.c * z_theta + turned(line, past, before)),
-            "gap": lambda: u * (past - before),
-            "z": lambda: u * z_rho,
-            "length": lambda: u * (past + before),
-            "zz": lambda: u * z_rho * z_rho,
-            "zt": lambda: u * z_rho * z_theta,
-            "tt": lambda: u * z_theta * z_theta,
+        swing = past * (r.dy * x1 - r.dx * y1 - across) - before * (r.dy * x2 - r.dx * y2 - across)
+        return {
+            "u": u,
+            "x": u * z_rho * (a * line[2]),
+            "y": u * z_rho * (a * line[3]),
+            "theta": u * (b * z_rho + r.c * z_theta + swing),
+            "gap": u * (past - before),
+            "z": u * z_rho,
+            "length": u * gap,
+            "zz": u * z_rho * z_rho,
+            "zt": u * z_rho * z_theta,
+            "tt": u * z_theta * z_theta,
         }
-        total = {name: value + of[name]() for name, value in total.items()}
+
+    for line in group:
+        term = terms(line)
+        total = {name: value + term[name] for name, value in total.items()}
     return total
 
 
+# On the CPU, XLA writes one loop for every result, and each would work out its pairs anew. Two sums
+# that share their terms travel as one complex number, so that one loop makes both.
+TWINS = (("x", "y"), ("theta", "gap"), ("z", "length"), ("zz", "tt"))
+
+
+def _pair_up(sums):
+    twins = {pair: lax.complex(*(sums[name] for name in pair)) for pair in TWINS if pair[0] in sums}
+    return {name: sums[name] for name in ("u", "zt") if name in sums}, twins
+
+
+def _apart(carried):
+    singles, twins = carried
+    for (first, second), value in twins.items():
+        singles = singles | {first: lax.real(value), second: lax.imag(value)}
+    return singles
+
+
 def _by_map(lines, cloud, seen, e_max, tau, counts):
-    """The same value by plain JAX, one map segment at a time: what derivatives by the map go through.
+    """The same value by plain JAX, one map segment at a time, for the derivatives by the map.
 
     Only the [M, N] sum is carried. It is linear in what a step adds, so going back needs no copy of
     it, and the step is worked out again instead of kept.

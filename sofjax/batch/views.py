@@ -13,9 +13,7 @@ from sofjax.geometry.two_view import two_view_homography
 
 
 @jax.jit
-def homographies(
-    camera: Camera, mount: Mount, T_first_second: SE2
-) -> Float[Array, "N 3 3"]:
+def homographies(camera: Camera, mount: Mount, T_first_second: SE2) -> Float[Array, "N 3 3"]:
     """The homography that the floor induces between two images, for N motions; eq. (8).
 
     **Arguments:**
@@ -29,9 +27,7 @@ def homographies(
 
 
 @jax.jit
-def transferred_lines(
-    H: Float[Array, "N 3 3"], first: Segments
-) -> Float[Array, "N M 3"]:
+def transferred_lines(H: Float[Array, "N 3 3"], first: Segments) -> Float[Array, "N M 3"]:
     """l'' ~ H^-T l, the lines of M segments of the first image as N homographies move them.
 
     **Arguments:**
