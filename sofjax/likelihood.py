@@ -169,10 +169,9 @@ def compare(
     inlier = used & sightings.valid & (pick(loose) < sensor.e_max)
 
     d = jnp.where(inlier[:, None], pick(difference), 0)
-    W = pick(candidates.precision)
+    W = jnp.where(inlier[:, None, None], pick(candidates.precision), 0)
     JW = jnp.swapaxes(sightings.tilt, -1, -2) @ W
-    weight = inlier[:, None, None]
-    information = jnp.sum(jnp.where(weight, JW @ sightings.tilt, 0), axis=0)
+    information = jnp.sum(JW @ sightings.tilt, axis=0)
     gradient = jnp.sum((JW @ d[..., None])[..., 0], axis=0)
     variance = sensor.tilt_sigma**2  # (I + variance A)^-1 variance b: right for variance = 0 too
     a, b, c = (

@@ -43,6 +43,6 @@ def winner(log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
 
 
 def mean_pose(particles: Particles) -> SE2:
-    """Weighted mean, the yaw about that of the heaviest particle."""
+    """Weighted mean; of the yaw too, which is not wrapped and so has no jump within the cloud."""
     w = jnp.exp(particles.log_weight)
     return SE2(w @ particles.T_world_robot.xy, w @ particles.T_world_robot.yaw)

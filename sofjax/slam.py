@@ -133,7 +133,7 @@ def step(
     view = _view_a_baseline_away(config.association, state, predicted)
     sof = lambda T: extract(
         config.association, camera, mount, view.segments_image, observation.segments_image,
-        view.T_world_robot.between(T),
+        view.T_world_robot.between(T), config.filter.max_depth,
     ).is_floor  # fmt: skip
     is_sof = sof(predicted)
     used = jax.vmap(sof)(T_world_robot) if config.filter.gate_each else sightings.valid[None]
@@ -160,9 +160,10 @@ def step(
 
     # 6) integrate the observed segments into the map, as seen from the chosen pose
     T_world_foot_chosen = chosen @ mount.T_robot_foot
-    best = of_pose(T_world_foot.between(T_world_foot_chosen), sightings.valid)
-    known = sightings.valid & (best.error < sensor.e_max)
-    new = is_sof & (nearest > sensor.e_max) & sightings.valid & ~known
+    counted = sof(chosen) if config.filter.gate_each else sightings.valid
+    best = of_pose(T_world_foot.between(T_world_foot_chosen), counted)
+    known = counted & (best.error < sensor.e_max)
+    new = is_sof & (nearest > sensor.e_max) & counted & ~known
     segment_map, overflow = integrate(
         rules, sensor, state.segment_map, sightings,
         jnp.take_along_axis(slot, best.choice[:, None], 1)[:, 0],
@@ -228,6 +229,7 @@ def _keep_views(config, state, observation, T_world_robot):
     view = View(observation.segments_image, T_world_robot)
     first = ~state.recent.segments_image.valid.any()
     keep = _far_enough(config, state.recent, T_world_robot) | first
+    keep = keep & observation.segments_image.valid.any()  # nothing can be compared with the dark
     pick = lambda a, b: jax.tree.map(lambda x, y: jnp.where(keep, x, y), a, b)
     return pick(view, state.recent), pick(state.recent, state.reference)
 

@@ -184,11 +184,6 @@ def test_the_side_a_segment_is_named_from_does_not_matter():
         np.testing.assert_allclose(ends_of(there), ends_of(back), atol=1e-9)
 
 
-NAMED_BOTH_WAYS = pytest.mark.xfail(
-    strict=True, reason="covariances of a line's two names are added as if they were of one"
-)
-
-
 def named_both_ways(correlation=0.8):
     """One sighting with correlated errors of rho and theta, by either of its names."""
     for ends, sign in ((across(1.2), 1), (across(1.2)[::-1], -1)):
@@ -198,7 +193,6 @@ def named_both_ways(correlation=0.8):
         )
 
 
-@NAMED_BOTH_WAYS
 def test_correlated_errors_turn_with_the_name_when_lines_are_proposed():
     m = seen(empty_map(KALMAN), across(1.0), rules=KALMAN, sigma=0.1)
     m = dataclasses.replace(
@@ -208,7 +202,6 @@ def test_correlated_errors_turn_with_the_name_when_lines_are_proposed():
     assert there[2][0] == pytest.approx(float(back[2][0]))
 
 
-@NAMED_BOTH_WAYS
 def test_correlated_errors_turn_with_the_name_when_a_line_is_updated():
     m = seen(empty_map(KALMAN), across(1.0), rules=KALMAN, sigma=0.1)
     known = jnp.arange(M) < 1
@@ -565,7 +558,7 @@ def random_map(rng):
     return m
 
 
-@pytest.mark.parametrize("propagate", [pytest.param(True, marks=NAMED_BOTH_WAYS), False])
+@pytest.mark.parametrize("propagate", [True, False])
 def test_the_candidates_are_the_nearest_lines_of_a_loop_over_all_pairs(propagate, rng):
     rules = dataclasses.replace(KALMAN, rho_drift=0.01, theta_drift=0.02, candidates=3)
     sensor = SensorModel(propagate=propagate, tilt_sigma=0.05)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sofjax.geometry.angles import wrap
-from sofjax.geometry.lines import PolarLine, polar_difference
+from sofjax.geometry.lines import PolarLine, alignment, polar_difference, rename_covariance
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
@@ -38,8 +38,9 @@ def propose(
 
     # all M × K pairs, in numbers and not in 2×2 matrices: so they compile to one loop
     near, far = sightings.covariance + tilting, spread + drift
-    s = lambda i, j: near[:, None, i, j] + far[:, i, j]
     observed = PolarLine(sightings.line.rho[:, None], sightings.line.theta[:, None])
+    side = alignment(observed, lines)  # a sighting may be named from the other side
+    s = lambda i, j: near[:, None, i, j] + (1 if i == j else side) * far[:, i, j]
     d_rho, d_theta = jnp.moveaxis(polar_difference(observed, lines), -1, 0)
     error = s(1, 1) * d_rho**2 - 2 * s(0, 1) * d_rho * d_theta + s(0, 0) * d_theta**2
     error = error / (s(0, 0) * s(1, 1) - s(0, 1) ** 2)
@@ -56,7 +57,8 @@ def propose(
         possible = possible & (jnp.abs(wrap(observed.theta - lines.theta)) < jnp.pi / 2)
     error = jnp.where(possible, error, jnp.inf)
     best, slot = jax.lax.top_k(-error, rules.candidates)
-    S = sightings.covariance[:, None] + far[slot]
+    far = rename_covariance(far[slot], jnp.take_along_axis(side, slot, axis=1))
+    S = sightings.covariance[:, None] + far
     candidates = Candidates(
         line=PolarLine(lines.rho[slot], lines.theta[slot]),
         kappa=seen[slot, 2],

@@ -6,7 +6,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.angles import safe_norm, safe_sqrt, wrap, wrap_axial
-from sofjax.geometry.lines import PolarLine, direction, normal, polar_difference, polar_through
+from sofjax.geometry.lines import (
+    PolarLine,
+    alignment,
+    direction,
+    normal,
+    polar_difference,
+    polar_through,
+    rename_covariance,
+)
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments, overlap
@@ -64,12 +72,12 @@ def _measure(rules, sensor, m, sightings, slot, tilt, T_world_foot) -> _Measurem
     expected, H = jax.vmap(appear, in_axes=(0, 0, None))(m.line, m.anchor, T_world_foot)
     at = jnp.minimum(slot, K - 1)
     # by the map line's name: a sighting may be named from the other side
-    innovation = -polar_difference(
-        PolarLine(expected[at, 0], expected[at, 1]), sightings.under_tilt(tilt)
-    )
+    line, observed = PolarLine(expected[at, 0], expected[at, 1]), sightings.under_tilt(tilt)
+    innovation = -polar_difference(line, observed)
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
     wobble = sensor.tilt_sigma**2 * sightings.tilt @ jnp.swapaxes(sightings.tilt, 1, 2)
-    precision = inverse_2x2(sightings.covariance + drift + TILT_LEFT * wobble)
+    noise = rename_covariance(sightings.covariance + TILT_LEFT * wobble, alignment(line, observed))
+    precision = inverse_2x2(noise + drift)
     touched = by_line(jnp.ones(slot.shape)) > 0
     total = by_line(precision)
     seen = touched[:, None, None]
