@@ -26,7 +26,8 @@ class SensorModel(eqx.Module):
     rho_sigma: float = 0.02  # metres; the constant sigmas, and with `propagate` ...
     theta_sigma: float = 0.02  # radians; ... unused
     theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
-    adaptation: float = 1.0  # share of the surplus misfit by which the noise grows in a step
+    adaptation: float = 0.3  # share of the surplus misfit by which the noise grows in a step
+    noise_max: float = 100.0  # multiple of the variance beyond which it does not grow
     e_max: float = 9.0  # cost of an observed segment that matches nothing
 
 
@@ -101,9 +102,11 @@ def adapt_noise(
 
     A mount that is only roughly known, a rolling shutter or blur make all of them inconsistent,
     and a filter that is too sure of its sensor then leaves the odometer. Matched errors e have
-    the mean 2; the noise never falls below the sensor model's.
+    the mean 2; the noise never falls below the sensor model's, nor grows so far that nothing
+    is ever matched again.
     """
-    return jnp.maximum(noise * jnp.exp(sensor.adaptation * (misfit / 2 - 1)), 1)
+    grown = noise * jnp.exp(sensor.adaptation * (misfit / 2 - 1))
+    return jnp.clip(grown, 1, sensor.noise_max)
 
 
 class Candidates(eqx.Module):

@@ -20,7 +20,7 @@ class MotionModel(eqx.Module):
     lateral_noise: float = 0.002  # metres per sqrt(metre)
     heading_noise: float = 0.005  # radians per sqrt(metre)
     turn_noise: float = 0.01  # radians per sqrt(radian)
-    distance_scale_sigma: float = 0.02
+    distance_scale_sigma: float = 0.01
     turn_scale_sigma: float = 0.05
     curvature_sigma: float = 0.005  # radians per metre
     bias_drift: float = 0.02  # share of its prior that a systematic error wanders in sqrt(metre)

@@ -371,3 +371,4 @@ def test_noise_is_believed_where_matches_disagree_and_never_below_the_model():
     assert noise(1.0, 4.0) == pytest.approx(np.exp(0.5))
     assert 1 < noise(3.0, 0.5) < 3
     assert noise(1.0, 0.0) == 1
+    assert noise(50.0, 9.0) == sensor.noise_max  # grown so far, it could never match again
