@@ -209,9 +209,7 @@ def test_views_that_are_all_alike_are_judged():
 
 def test_what_the_views_do_not_fix_is_not_written(rays, tmp_path, capfd):
     rng = np.random.default_rng(6)
-    images = [
-        render(rays, BOARD, (0.0, 0.0, 0.02 * i), (0.0, 0.0, 0.6), rng) for i in range(6)
-    ]
+    images = [render(rays, BOARD, (0.0, 0.0, 0.02 * i), (0.0, 0.0, 0.6), rng) for i in range(6)]
     folder, out = write(tmp_path / "views", images), tmp_path / "camera.yaml"
     assert main(["calibrate", "camera", str(folder), *ARGS, "-o", str(out)]) == 3
     said = capfd.readouterr().out

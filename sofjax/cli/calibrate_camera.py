@@ -139,9 +139,7 @@ def numbers(fit: "CameraFit") -> list[str]:
     ]
 
 
-def summary(
-    board: "Board", fit: "CameraFit", verdict: "Verdict", left_out: dict[str, str]
-) -> str:
+def summary(board: "Board", fit: "CameraFit", verdict: "Verdict", left_out: dict[str, str]) -> str:
     """The fit for a person: every view, the numbers, what they are worth."""
     usual = sorted(view.error for view in fit.views if view.used)
     usual = usual[len(usual) // 2]

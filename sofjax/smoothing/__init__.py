@@ -6,13 +6,19 @@ odometer's readings with their covariance. What makes it fast is the arrow shape
 observation ties one pose to one line, the odometer one pose to the next. The poses are eliminated
 by a block-tridiagonal sweep, and a dense system of the lines and of what all share remains.
 
-This is the solve alone, for associations that are given: no command uses it yet.
+`solve` is one solution for associations that are given; `smooth` finds the associations as well.
 """
 
+from sofjax.smoothing.lines import Lines as Lines
+from sofjax.smoothing.lines import Seeing as Seeing
 from sofjax.smoothing.problem import Keyframes as Keyframes
 from sofjax.smoothing.problem import Priors as Priors
 from sofjax.smoothing.problem import Problem as Problem
 from sofjax.smoothing.problem import Unknowns as Unknowns
 from sofjax.smoothing.problem import residuals as residuals
+from sofjax.smoothing.rounds import Path as Path
+from sofjax.smoothing.rounds import Smoothed as Smoothed
+from sofjax.smoothing.rounds import SmoothingRules as SmoothingRules
+from sofjax.smoothing.rounds import smooth as smooth
 from sofjax.smoothing.solution import Solution as Solution
 from sofjax.smoothing.solution import solve as solve

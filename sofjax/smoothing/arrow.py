@@ -86,33 +86,22 @@ def assemble(mv, keyframes: Keyframes, like: Unknowns, damping: Float[Array, ""]
     same unknown of every other keyframe, or of every line, gives a whole column of all blocks.
     """
     n, K = like.pose.shape[0], like.line.shape[0]
+    even = jnp.arange(n) % 2 == 0
+    column = jax.vmap(mv, out_axes=-1)  # all products at once: one program to compile
     zero = jax.tree.map(jnp.zeros_like, like)
-    parity = jnp.arange(n) % 2
-
-    def pose_column(d):
-        even, odd = (
-            mv(
-                eqx.tree_at(
-                    lambda u: u.pose, zero, zero.pose.at[:, d].set(jnp.where(parity == p, 1.0, 0.0))
-                )
-            )
-            for p in (0, 1)
-        )
-        mine = lambda a, b: jnp.where((parity == 0).reshape(-1, *[1] * (a.ndim - 1)), a, b)
-        own = mine(even.odometer, odd.odometer)  # residual i by pose i ...
-        before = mine(odd.odometer, even.odometer)  # ... and by pose i - 1
-        return mine(even.pixels, odd.pixels), own, before.at[0].set(0), mine(even.tilt, odd.tilt)
-
-    P, O, Q, T = (jnp.stack(c, axis=-1) for c in zip(*map(pose_column, range(POSE)), strict=True))
-    columns = [
-        mv(eqx.tree_at(lambda u: u.line, zero, zero.line.at[:, d].set(1.0))) for d in range(LINE)
-    ]
-    L = jnp.stack([c.pixels for c in columns], axis=-1)  # [n, M, 2, 3]
-    R = jnp.stack([c.line for c in columns], axis=-1)  # [K, 3, 3]
-    columns = [
-        mv(eqx.tree_at(lambda u: u.shared, zero, zero.shared.at[d].set(1.0))) for d in range(SHARED)
-    ]
-    G = jax.tree.map(lambda *c: jnp.stack(c, axis=-1), *columns)
+    ones = lambda a: jnp.moveaxis(
+        jnp.broadcast_to(jnp.eye(a.shape[-1]), (*a.shape, a.shape[-1])), -1, 0
+    )
+    probe = lambda where, value: column(_probes(zero, where, value))
+    of_pose = lambda mask: probe(lambda u: u.pose, jnp.where(mask[:, None], ones(like.pose), 0.0))
+    first, second = of_pose(even), of_pose(~even)
+    mine = lambda a, b: jnp.where(even.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    P, T = mine(first.pixels, second.pixels), mine(first.tilt, second.tilt)
+    O = mine(first.odometer, second.odometer)  # residual i by pose i ...
+    Q = mine(second.odometer, first.odometer).at[0].set(0)  # ... and by pose i - 1
+    of_line = probe(lambda u: u.line, ones(like.line))
+    L, R = of_line.pixels, of_line.line  # [n, M, 2, 3] and [K, 3, 3]
+    G = probe(lambda u: u.shared, ones(like.shared))
 
     diagonal = (
         jnp.einsum("nmri,nmrj->nij", P, P)
@@ -156,6 +145,12 @@ def assemble(mv, keyframes: Keyframes, like: Unknowns, damping: Float[Array, ""]
         corner.at[K * LINE :, : K * LINE].set(line_shared.T).at[K * LINE :, K * LINE :].set(shared)
     )
     return Arrow(diagonal, upper, border, corner, line)
+
+
+def _probes(zero: Unknowns, where, value) -> Unknowns:
+    """As many unknowns as `value` has, which are zero but for one part."""
+    batch = jax.tree.map(lambda a: jnp.broadcast_to(a, (value.shape[0], *a.shape)), zero)
+    return eqx.tree_at(where, batch, value)
 
 
 class ArrowSolver(lx.AbstractLinearSolver):

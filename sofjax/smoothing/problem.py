@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography
 from sofjax.geometry.lines import cofactor, line_point_distance
@@ -138,20 +139,33 @@ def odometer_residual(
     return (moved - read) / sigma
 
 
-def residuals(unknowns: Unknowns, problem: Problem) -> Residuals:
-    """All of them, about the estimate."""
-    k, priors = problem.keyframes, problem.priors
+def distances(unknowns: Unknowns, problem: Problem) -> Float[Array, "n M 2"]:
+    """Of the ends of each segment from the line that it shows, pixels; zero if it shows none."""
+    k = problem.keyframes
 
     def of_keyframe(pose, endpoints, index, known):
         of_segment = lambda segment, j: pixel_residual(
             problem, pose, unknowns.line[j], unknowns.shared,
             jax.tree.map(lambda a: a[j], problem.anchor), segment,
         )  # fmt: skip
-        r = jax.vmap(of_segment)(endpoints, index) / priors.pixel_sigma
-        r = jnp.where(known[:, None], r, 0)
-        return jax.vmap(robust, in_axes=(0, None))(r, priors.loss_scale)
+        return jnp.where(known[:, None], jax.vmap(of_segment)(endpoints, index), 0)
 
-    pixels = jax.vmap(of_keyframe)(unknowns.pose, k.segments_image.endpoints, k.line, k.known)
+    return jax.vmap(of_keyframe)(unknowns.pose, k.segments_image.endpoints, k.line, k.known)
+
+
+def misfit(problem: Problem) -> Float[Array, ""]:
+    """Root mean square of the distances at the start, pixels; zero where nothing is known."""
+    known = 2 * problem.keyframes.known.sum()
+    total = jnp.sum(distances(problem.start, problem) ** 2)
+    return safe_sqrt(total / jnp.maximum(known, 1).astype(total.dtype))
+
+
+def residuals(unknowns: Unknowns, problem: Problem) -> Residuals:
+    """All of them, about the estimate."""
+    k, priors = problem.keyframes, problem.priors
+
+    r = distances(unknowns, problem) / priors.pixel_sigma
+    pixels = jax.vmap(jax.vmap(robust, in_axes=(0, None)), in_axes=(0, None))(r, priors.loss_scale)
     odometer = jax.vmap(odometer_residual, in_axes=(None, 0, 0, None, 0, 0))(
         problem, unknowns.pose[:-1], unknowns.pose[1:], unknowns.shared,
         jax.tree.map(lambda a: a[1:], k.motion), k.way[1:],

@@ -9,6 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 from sofjax.smoothing.arrow import ArrowSolver, assemble
 from sofjax.smoothing.problem import LINE, Problem, Unknowns, residuals
 
+TOLERANCE = 1e-4  # metres, radians and, relative, of the cost: of the last step
+
 
 class Solution(eqx.Module):
     """The estimate and how sure it is."""
@@ -20,6 +22,7 @@ class Solution(eqx.Module):
     converged: Bool[Array, ""]
     pose_covariance: Float[Array, "n 5 5"]
     line_covariance: Float[Array, "K 3 3"]
+    joint: Float[Array, "K 3 K 3"]  # covariance of all lines with each other
     shared_covariance: Float[Array, "8 8"]
     kappa_free: Float[Array, "K"]  # each line's kappa if it alone were free, poses held ...
     kappa_sigma: Float[Array, "K"]  # ... and its standard deviation
@@ -37,7 +40,7 @@ def solve(problem: Problem, max_steps: int = 60) -> Solution:
     not suffice; the estimate is then the best so far.
     """
     solver = optx.LevenbergMarquardt(
-        rtol=1e-5, atol=1e-5, linear_solver=ArrowSolver(problem.keyframes)
+        rtol=TOLERANCE, atol=TOLERANCE, linear_solver=ArrowSolver(problem.keyframes)
     )
     found = optx.least_squares(
         residuals, solver, problem.start, problem, max_steps=max_steps, throw=False
@@ -69,6 +72,7 @@ def solve(problem: Problem, max_steps: int = 60) -> Solution:
         converged=found.result == optx.RESULTS.successful,
         pose_covariance=pose,
         line_covariance=lines[k, :, k, :],
+        joint=lines,
         shared_covariance=rest[K * LINE :, K * LINE :],
         kappa_free=free,
         kappa_sigma=jnp.sqrt(alone[:, 2, 2]),

@@ -94,9 +94,7 @@ def find_corners(image: np.ndarray, board: Board) -> np.ndarray | None:
     gap = min(np.linalg.norm(np.diff(grid, axis=a), axis=-1).min() for a in (0, 1))
     window = int(np.clip(WINDOW * gap, 2, MAX_WINDOW))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
-    refined = cv2.cornerSubPix(
-        image, np.float32(corners).copy(), (window, window), (-1, -1), stop
-    )
+    refined = cv2.cornerSubPix(image, np.float32(corners).copy(), (window, window), (-1, -1), stop)
     return refined.reshape(-1, 2)
 
 

@@ -1,0 +1,98 @@
+"""The lines that are solved for, and which of them each segment of the keyframes shows."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sofjax.geometry.camera import Camera, Mount
+from sofjax.geometry.floor import floor_homography, segment_to_floor
+from sofjax.geometry.lines import PolarLine, cofactor, direction, line_point_distance, normal
+from sofjax.geometry.se2 import SE2
+from sofjax.geometry.segments import Segments, overlap
+from sofjax.segment_map import appear
+from sofjax.smoothing.problem import Unknowns, corrected
+
+
+class Lines(eqx.Module):
+    """K lines and how far along them something was seen."""
+
+    anchor: SE2  # [K] T_world_foot in which each line is described
+    line: Float[Array, "K 3"]  # (rho, theta, kappa) about the anchor
+    reach: Float[Array, "K 2"]  # first and last place along the line, metres from the anchor
+    raised: Bool[Array, "K"]  # not on the floor: kappa is free
+    valid: Bool[Array, "K"]
+
+    @property
+    def endpoints_world(self) -> Float[Array, "K 2 2"]:
+        """End points, at the lines' true places: kappa magnifies rho."""
+        polar = PolarLine(self.line[:, 0] / self.line[:, 2], self.line[:, 1])
+        foot = normal(polar) * polar.rho[:, None]
+        ends = foot[:, None] + self.reach[..., None] * direction(polar)[:, None]
+        return jax.vmap(lambda T, e: T.apply(e))(self.anchor, ends)
+
+
+def lines_of(
+    anchor: SE2, line: Array, endpoints_world: Array, raised: Array, valid: Array
+) -> Lines:
+    """Lines whose reach is that of segments along them."""
+    local = jax.vmap(lambda T, e: T.inverse().apply(e))(anchor, endpoints_world)
+    along = jnp.einsum("kij,kj->ki", local, direction(PolarLine(line[:, 0], line[:, 1])))
+    return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid)
+
+
+class Seeing(eqx.Module):
+    """How segments are told to show lines."""
+
+    gate: float = 3.0  # pixels that an end may be off its line
+    angle: float = 0.15  # radians between a segment and its line in the image
+    join_gap: float = 0.1  # metres that a segment may lie beyond what was seen of its line
+    max_depth: float = 8.0  # metres: what is farther is not used
+
+
+def foot_mount(mount: Mount, pose: Float[Array, "5"]) -> Mount:
+    """The mount about the foot, with the wobble of a keyframe."""
+    zero = jnp.zeros_like(mount.height)
+    return Mount(zero, zero, mount.height, mount.pitch + pose[3], mount.roll + pose[4], mount.yaw)
+
+
+def associate(
+    seeing: Seeing, camera: Camera, mount: Mount, lines: Lines, unknowns: Unknowns,
+    segments_image: Segments,
+) -> tuple[Int[Array, "n M"], Bool[Array, "n M"]]:  # fmt: skip
+    """For each segment of each keyframe the line that lies nearest to both of its ends, in pixels.
+
+    **Returns:** the line's index, and whether there is one within the gates.
+    """
+    mount = corrected(mount, unknowns.shared)
+    ends_world = lines.endpoints_world
+
+    def of_keyframe(each):
+        pose, endpoints, valid = each
+        T_world_foot = SE2(pose[:2], pose[2]) @ mount.T_robot_foot
+        H_F = floor_homography(camera, foot_mount(mount, pose), SE2.identity())
+        seen, _ = jax.vmap(appear, in_axes=(0, 0, None))(lines.line, lines.anchor, T_world_foot)
+        n = normal(PolarLine(seen[:, 0], seen[:, 1]))
+        l = jnp.concatenate([n, -seen[:, :1]], axis=1) @ cofactor(H_F).T
+        distance = jax.vmap(jax.vmap(line_point_distance, in_axes=(0, None)), in_axes=(None, 0))
+        first, second = distance(l, endpoints[:, 0]), distance(l, endpoints[:, 1])
+        length = jnp.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=1)[:, None]
+
+        on_floor, some = jax.vmap(segment_to_floor, in_axes=(None, 0, None))(
+            H_F, endpoints, jnp.asarray(seeing.max_depth, pose.dtype)
+        )
+        apparent = T_world_foot.inverse().apply(ends_world) * seen[:, 2, None, None]
+        shared = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))
+        possible = (
+            (jnp.maximum(jnp.abs(first), jnp.abs(second)) < seeing.gate)
+            & (jnp.abs(first - second) < seeing.angle * length)
+            & (shared(apparent, on_floor) > -seeing.join_gap)
+            & lines.valid
+            & (valid & some)[:, None]
+        )
+        off = jnp.where(possible, first**2 + second**2, jnp.inf)
+        return off.argmin(axis=1), possible.any(axis=1)
+
+    return jax.lax.map(
+        of_keyframe, (unknowns.pose, segments_image.endpoints, segments_image.valid), batch_size=8
+    )

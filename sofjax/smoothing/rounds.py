@@ -1,0 +1,199 @@
+"""Solve, and ask again which segment shows which line, which lines are one, and which are raised.
+
+Associations that were made online bake the mistakes of the moment in; with the poses of a solution
+they are made anew, and then the solution is found anew.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sofjax.geometry.camera import Camera, Mount
+from sofjax.geometry.se2 import SE2
+from sofjax.observation import Observation
+from sofjax.segment_map import MapRules, SegmentMap, is_raised
+from sofjax.slam import SlamConfig
+from sofjax.smoothing import keyframes as kf
+from sofjax.smoothing.extents import reaches
+from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
+from sofjax.smoothing.merging import doubles, representatives
+from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, misfit
+from sofjax.smoothing.solution import Solution, solve
+
+
+class SmoothingRules(eqx.Module):
+    """When a drive is smoothed, and how."""
+
+    priors: Priors = Priors()
+    rounds: int = eqx.field(static=True, default=3)  # of association and solution
+    step: float = 0.25  # heights of the camera between keyframes ...
+    turn: float = 0.1  # ... or radians
+    min_sightings: int = 3  # keyframes that a line takes
+    seeing: Seeing = Seeing()
+
+
+DEFAULT = SmoothingRules()
+
+
+class Path(eqx.Module):
+    """What a drive was taken to be, image by image."""
+
+    T_world_robot: SE2  # [T]
+    tilt: Float[Array, "T 2"]  # wobble (pitch, roll) of each image, radians
+    bias: Float[Array, "4"]  # the odometer's errors in the end
+
+
+class Smoothed(eqx.Module):
+    """The whole drive solved for. Arrays are of float64, on the host."""
+
+    T_world_robot: SE2  # [T] all images, moved along with their keyframes
+    index: Int[np.ndarray, "n"]  # the keyframes' images
+    mount: Mount  # with what was found of it
+    lines: Lines  # [K]
+    sightings: Int[Array, "K"]  # segments that show each line
+    problem: Problem  # as it stood at the last solution; its keyframes [n'] are padded
+    solution: Solution
+    costs: list[tuple[float, float]]  # before and after each solution
+    merged: int  # lines that went on as another
+
+
+def smooth(
+    config: SlamConfig,
+    camera: Camera,
+    mount: Mount,
+    log: Observation,
+    path: Path,
+    segment_map: SegmentMap,
+    rules: SmoothingRules = DEFAULT,
+) -> Smoothed:
+    """Poses, lines, the odometer's errors and, where its prior is not zero, the mount, at once.
+
+    In float64, whatever the caller's precision is.
+
+    **Arguments:**
+    - `config`: with which the filter ran.
+    - `mount`: from which the fit starts, and at which it stays if `rules.priors` leaves it fixed.
+    - `log`: the drive's observations, leading T, of two images or more.
+    - `path`, `segment_map`: as the filter left them.
+
+    **Returns:** the last round's solution; `solution.converged` says whether it settled.
+    """
+    with jax.enable_x64(True):
+        config, camera, mount, log, path, segment_map, rules = map(
+            _in_double, (config, camera, mount, log, path, segment_map, rules)
+        )
+        index = kf.choose(path.T_world_robot, float(rules.step * mount.height), float(rules.turn))
+        frames = kf.gather(log, index)
+        lines = _lines_of_map(config.segment_map, segment_map, int(rules.min_sightings))
+        start = _start(path, index, lines, frames)
+        problem = Problem(
+            camera, mount, config.motion, rules.priors, frames, lines.anchor, lines.raised, start
+        )
+        costs, merged = [], 0
+        for _ in range(rules.rounds):
+            problem = _associated(rules.seeing, problem, lines)
+            problem, lines, solution = _solved(config.segment_map, rules, problem, lines)
+            costs.append((float(solution.cost_before), float(solution.cost)))
+            into, joins = doubles(lines, solution.joint, _sightings(problem.keyframes, lines))
+            if joins.any():
+                merged += int(joins.sum())
+                name = representatives(np.asarray(into), np.asarray(joins))
+                problem, lines = _renamed(problem, lines, name)
+                problem, lines, solution = _solved(config.segment_map, rules, problem, lines)
+                costs.append((float(solution.cost_before), float(solution.cost)))
+        found = SE2(
+            *(a[: len(index)] for a in (problem.start.pose[:, :2], problem.start.pose[:, 2]))
+        )
+        return jax.device_get(
+            Smoothed(
+                T_world_robot=kf.carry(path.T_world_robot, index, found),
+                index=index,
+                mount=corrected(mount, problem.start.shared),
+                lines=lines,
+                sightings=_sightings(problem.keyframes, lines),
+                problem=problem,
+                solution=solution,
+                costs=costs,
+                merged=merged,
+            )
+        )
+
+
+def _in_double(tree):
+    def one(leaf):
+        leaf = np.asarray(leaf)
+        return jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
+
+    return jax.tree.map(one, tree)
+
+
+def _lines_of_map(rules: MapRules, m: SegmentMap, least: int) -> Lines:
+    """The map's lines that were seen often enough to be worth a solution."""
+    live = np.flatnonzero(np.asarray(m.valid & (m.updates >= least)))
+    K = kf.padded(max(len(live), 1))
+    slots = np.concatenate([live, np.zeros(K - len(live), int)])
+    m = jax.tree.map(lambda a: a[slots], m)
+    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
+    line = jnp.where(raised[:, None], m.line, _on_floor(m.line, m.covariance))
+    return lines_of(m.anchor, line, m.segments_world.endpoints, raised, jnp.arange(K) < len(live))
+
+
+def _on_floor(line, covariance):
+    gain = covariance[:, :, 2] / covariance[:, 2:, 2]
+    return (line + gain * (1 - line[:, 2:])).at[:, 2].set(1)
+
+
+def _start(path: Path, index: np.ndarray, lines: Lines, frames: Keyframes) -> Unknowns:
+    n = frames.way.shape[0]
+    filled = np.concatenate([index, np.full(n - len(index), index[-1])])
+    T, tilt = path.T_world_robot, path.tilt
+    pose = jnp.concatenate([T.xy[filled], T.yaw[filled, None], tilt[filled]], axis=1)
+    return Unknowns(pose, lines.line, jnp.concatenate([jnp.zeros(4), path.bias]))
+
+
+@jax.jit
+def _associated(seeing: Seeing, problem: Problem, lines: Lines) -> Problem:
+    """With the segments' lines as they are by the present estimate."""
+    found = associate(
+        seeing, problem.camera, problem.mount, lines, problem.start,
+        problem.keyframes.segments_image,
+    )  # fmt: skip
+    return eqx.tree_at(lambda p: (p.keyframes.line, p.keyframes.known), problem, found)
+
+
+def _solved(rules: MapRules, smoothing: SmoothingRules, problem: Problem, lines: Lines):
+    """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
+    problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
+    solution = solve(problem)
+    return *_settled(rules, smoothing, problem, lines, solution), solution
+
+
+@jax.jit
+def _settled(rules, smoothing, problem, lines, solution):
+    kappa, sigma = solution.kappa_free, solution.kappa_sigma
+    outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
+    raised = outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
+    line = solution.unknowns.line
+    line = line.at[:, 2].set(jnp.where(raised, line[:, 2], 1))
+    unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
+    problem = eqx.tree_at(lambda p: p.start, problem, unknowns)
+    # believe the pixels less where they disagree more than they should
+    sigma = jnp.maximum(misfit(problem), smoothing.priors.pixel_sigma)
+    problem = eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
+    reach, seen = reaches(problem)
+    reach = jnp.where(seen[:, None], reach, lines.reach)
+    return problem, Lines(lines.anchor, line, reach, raised, lines.valid)
+
+
+def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
+    """Lines that are one go on as one: their segments show it, and its reach is that of all."""
+    frames = problem.keyframes
+    lines = eqx.tree_at(lambda l: l.valid, lines, lines.valid & (name == np.arange(len(name))))
+    return eqx.tree_at(lambda p: p.keyframes.line, problem, jnp.asarray(name)[frames.line]), lines
+
+
+def _sightings(frames: Keyframes, lines: Lines) -> Int[Array, "K"]:
+    K = lines.valid.shape[0]
+    return jnp.zeros(K, int).at[jnp.where(frames.known, frames.line, K)].add(1, mode="drop")

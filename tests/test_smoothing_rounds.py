@@ -1,0 +1,181 @@
+"""Keyframes, associations and merging by worked examples; the rounds on a small drive."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floor_to_image
+from sofjax.observation import Observation
+from sofjax.segment_map import MapRules, empty_map
+from sofjax.slam import SlamConfig
+from sofjax.smoothing import Path, Seeing, SmoothingRules, Unknowns, smooth
+from sofjax.smoothing import keyframes as kf
+from sofjax.smoothing.lines import associate, lines_of
+from sofjax.smoothing.merging import doubles, representatives
+
+
+def straight(n, step=0.1):
+    return SE2(jnp.stack([step * jnp.arange(n, dtype=float), jnp.zeros(n)], axis=1), jnp.zeros(n))
+
+
+def test_keyframes_are_a_distance_or_an_angle_apart():
+    xy = np.stack([[0, 0.1, 0.2, 0.3, 0.3, 0.3], np.zeros(6)], axis=1)
+    T = SE2(jnp.asarray(xy), jnp.asarray([0, 0, 0, 0, 0.2, 0.21]))
+    assert list(kf.choose(T, 0.19, 0.1)) == [0, 2, 4, 5]  # the last is always one
+    assert list(kf.choose(straight(1), 0.2, 0.1)) == [0]
+
+
+def test_motion_between_keyframes_is_the_motions_of_the_images_in_a_row(x64, rng):
+    motion = SE2(jnp.asarray(rng.normal(0, 0.1, (9, 2))), jnp.asarray(rng.normal(0, 0.3, 9)))
+    log = Observation(
+        Segments(jnp.zeros((9, 4, 2, 2)), jnp.ones((9, 4), bool)), motion, jnp.zeros(9, int)
+    )
+    frames = kf.gather(log, np.array([0, 3, 8]))
+    want = SE2.identity()
+    for i in range(1, 4):
+        want = want @ jax.tree.map(lambda a, i=i: a[i], motion)
+    np.testing.assert_allclose(frames.motion.xy[1], want.xy, atol=1e-12)
+    np.testing.assert_allclose(frames.motion.yaw[1], want.yaw, atol=1e-12)
+    forward, _, turn = motion.log()[4:9].T
+    np.testing.assert_allclose(
+        frames.way[2],
+        [abs(forward).sum(), turn[turn > 0].sum(), turn[turn < 0].sum()],
+        atol=1e-12,
+    )  # fmt: skip
+    # what is padded stands still and sees nothing
+    assert not frames.segments_image.valid[3:].any()
+    np.testing.assert_allclose(frames.way[3:], 0, atol=1e-12)
+    np.testing.assert_allclose(frames.motion.xy[3:], 0, atol=1e-12)
+
+
+def test_carried_poses_go_through_their_keyframes_and_keep_the_motion_between(x64, rng):
+    T, index = straight(11), np.array([0, 5, 10])
+    same = kf.carry(T, index, SE2(T.xy[index], T.yaw[index]))
+    np.testing.assert_allclose(same.xy, T.xy, atol=1e-7)
+    turned = SE2(jnp.array([[1.0, 1.0]]), jnp.array([0.5])) @ T
+    moved = kf.carry(T, index, SE2(turned.xy[index], turned.yaw[index]))
+    np.testing.assert_allclose(moved.xy, turned.xy, atol=1e-6)
+    any_pose = SE2(jnp.asarray(rng.normal(size=(3, 2))), jnp.asarray(rng.normal(size=3)))
+    through = kf.carry(T, index, any_pose)
+    np.testing.assert_allclose(through.xy[index], any_pose.xy, atol=1e-6)
+
+
+def lines_along_x(y, reach, raised=None):
+    """Lines parallel to the x axis, described from the origin."""
+    K = len(y)
+    ends = jnp.stack(
+        [jnp.asarray(reach, float), jnp.broadcast_to(jnp.asarray(y)[:, None], (K, 2))], -1
+    )
+    line = jnp.stack([jnp.asarray(y, float), jnp.zeros(K), jnp.ones(K)], axis=1)
+    raised = jnp.zeros(K, bool) if raised is None else jnp.asarray(raised)
+    anchor = SE2(jnp.zeros((K, 2)), jnp.zeros(K))
+    return lines_of(anchor, line, ends, raised, jnp.ones(K, bool))
+
+
+CAMERA = Camera(jnp.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]), 320, 240)
+MOUNT = Mount.create(x=0.1, height=0.8, pitch=0.4)
+
+
+def test_a_segment_shows_the_nearest_line_that_reaches_it():
+    lines = lines_along_x([0.3, 0.32, -0.3], [[1, 2], [1, 2], [4, 5]])
+    np.testing.assert_allclose(lines.endpoints_world[0], [[1, 0.3], [2, 0.3]], atol=1e-6)
+    H_F = floor_homography(CAMERA, MOUNT, SE2.identity())
+    floor = jnp.array([
+        [[1.2, 0.302], [1.8, 0.302]],  # the first line, though the second is near
+        [[1.2, -0.3], [1.8, -0.3]],  # on the third line, and 2.2 m before what was seen of it
+        [[1.2, 0.25], [1.8, 0.25]],  # far from all
+    ])  # fmt: skip
+    image, ahead = jax.vmap(jax.vmap(floor_to_image, (None, 0)), (None, 0))(H_F, floor)
+    assert ahead.all()
+    unknowns = Unknowns(jnp.zeros((1, 5)), lines.line, jnp.zeros(8))
+    index, known = associate(
+        Seeing(), CAMERA, MOUNT, lines, unknowns, Segments(image[None], jnp.ones((1, 3), bool))
+    )
+    assert known.tolist() == [[True, False, False]]
+    assert index[0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("y", "reach", "raised", "together", "is_one"),
+    [
+        (0.1, (1, 2), False, False, True),  # 10 cm off where 5 cm are a standard deviation
+        (0.1, (1, 2), False, True, False),  # but seen side by side they are two edges
+        (0.2, (1, 2), False, False, False),  # four standard deviations off
+        (0.1, (2.5, 3), False, False, False),  # half a metre beyond the other's end
+        (0.1, (1, 2), True, False, False),  # above the floor, and the other is on it
+    ],
+)
+def test_lines_are_one_where_what_is_known_of_both_together_allows_it(
+    y, reach, raised, together, is_one
+):
+    lines = lines_along_x([0.0, y], [(1, 2), reach], [False, raised])
+    sigma = jnp.diag(jnp.array([0.05, 0.01, 1e-6]))
+    joint = jnp.zeros((2, 3, 2, 3)).at[0, :, 0, :].set(0.01 * sigma @ sigma)
+    joint = joint.at[1, :, 1, :].set(sigma @ sigma)
+    if together:  # the same error in both: their difference is known well
+        joint = jnp.broadcast_to((sigma @ sigma)[None, :, None, :], (2, 3, 2, 3))
+    into, joins = doubles(lines, joint, jnp.array([9, 4]))
+    assert joins.tolist() == [False, is_one]
+    assert not is_one or into[1] == 0
+
+
+def test_names_are_handed_on_to_the_end():
+    into = np.array([0, 0, 1, 3])
+    assert representatives(into, np.array([False, True, True, False])).tolist() == [0, 0, 0, 3]
+
+
+@pytest.mark.slow
+def test_rounds_find_the_path_that_the_odometer_misread(rng):
+    """An odometer that reads 3 % too much, and a map that was made by it."""
+    T = straight(41, 0.05)
+    y = np.concatenate([np.full(12, 0.5), np.full(12, -0.6)])
+    start = np.tile(np.linspace(0.6, 3.9, 12), 2)
+    along = np.stack([np.stack([start, y], 1), np.stack([start + 0.2, y], 1)], axis=1)
+    across = np.stack([np.stack([start, y - 0.1], 1), np.stack([start, y + 0.1], 1)], axis=1)
+    floor = np.concatenate([along, across])
+
+    def see(T):
+        H_F = floor_homography(CAMERA, MOUNT, T)
+        image, ahead = jax.vmap(jax.vmap(floor_to_image, (None, 0)), (None, 0))(
+            H_F, jnp.asarray(floor)
+        )
+        inside = (image >= 0).all((1, 2)) & (image < jnp.array([320.0, 240.0])).all((1, 2))
+        return Segments(image, ahead.all(1) & inside)
+
+    seen = jax.jit(jax.vmap(see))(T)
+    noisy = Segments(seen.endpoints + rng.normal(0, 0.2, seen.endpoints.shape), seen.valid)
+    read = SE2(jnp.concatenate([jnp.zeros((1, 2)), 1.03 * jnp.diff(T.xy, axis=0)]), jnp.zeros(41))
+    log = Observation(noisy, read, jnp.zeros(41, int))
+    wrong = floor * [1.03, 1.0]  # [48, 2, 2]
+    K = len(floor)
+    m = empty_map(MapRules(capacity=K))
+    d = wrong[:, 1] - wrong[:, 0]
+    theta = np.arctan2(d[:, 1], d[:, 0])
+    rho = -np.sin(theta) * wrong[:, 0, 0] + np.cos(theta) * wrong[:, 0, 1]
+    m = replace(
+        m,
+        segments_world=Segments(jnp.asarray(wrong), jnp.ones(K, bool)),
+        line=jnp.stack([jnp.asarray(rho), jnp.asarray(theta), jnp.ones(K)], axis=1),
+        covariance=jnp.broadcast_to(jnp.diag(jnp.array([0.01, 0.01, 0.02]) ** 2), (K, 3, 3)),
+        updates=jnp.full(K, 9),
+    )
+    online = SE2(1.03 * T.xy, T.yaw)
+    path = Path(online, jnp.zeros((41, 2)), jnp.zeros(4))
+    done = smooth(SlamConfig(), CAMERA, MOUNT, log, path, m, SmoothingRules(rounds=2))
+    assert done.solution.converged
+    np.testing.assert_allclose(done.T_world_robot.xy, T.xy, atol=0.01)
+    assert np.abs(online.xy - T.xy).max() > 0.05
+    assert done.solution.unknowns.shared[4] == pytest.approx(-0.03, abs=0.01)
+    assert done.T_world_robot.xy.dtype == np.float64
+    assert done.merged >= 15  # the pieces of the two dashed lines; the bars across stay apart
+    bars = done.lines.valid[24:48]
+    assert bars.sum() >= 22
+    ends = np.asarray(done.lines.endpoints_world)[24:48]
+    often = bars & (done.sightings[24:48] > 8)
+    assert often.sum() > 10
+    np.testing.assert_allclose(
+        ends[often].mean(1)[:, 0], floor[24:].mean(1)[often][:, 0], atol=0.02
+    )
