@@ -17,6 +17,7 @@ class Association(eqx.Module):
     alpha: float = 1.0  # weight of |rho' - rho''|, 1 / pixel
     beta: float = 60.0  # weight of |theta' - theta''|, 1 / radian
     gate: float = 6.0  # Theta
+    temperature: float = 1.0  # of the soft gate, in units of epsilon; the soft filter alone has it
     baseline_distance: float = 0.15  # metres between the two views ...
     baseline_angle: float = 0.15  # ... or radians, whichever comes first
 
@@ -79,3 +80,14 @@ def associate(
     errors = jnp.where(first.valid & second.valid[:, None], errors, jnp.inf)
     error = errors.min(axis=1)
     return Matches(error, errors.argmin(axis=1), error < config.gate)
+
+
+def gate_probability(config: Association, error: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The gate of eq. (9) as one that opens slowly: 1 / (1 + exp((epsilon - Theta) / T)).
+
+    Zero where there is no candidate; with the derivatives by alpha, beta and Theta that a gate
+    which is open or shut does not have.
+    """
+    some = jnp.isfinite(error)
+    open_by = (config.gate - jnp.where(some, error, 0)) / config.temperature
+    return jnp.where(some, jax.nn.sigmoid(open_by), 0)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, segment_to_floor
 from sofjax.geometry.lines import PolarLine, polar_difference, polar_through
+from sofjax.geometry.matrices import determinant_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 
@@ -39,6 +40,7 @@ class Sightings(eqx.Module):
     line: PolarLine  # about the foot
     covariance: Float[Array, "*batch 2 2"]  # of (rho, theta), from noise of the end points alone
     tilt: Float[Array, "*batch 2 2"]  # d(rho, theta) / d(pitch, roll) of the camera's wobble
+    log_area: Float[Array, "*batch"] | float = 0.0  # log of (metres · radians) that a pixel² makes
 
     def under_tilt(self, tilt: Float[Array, "2"]) -> PolarLine:
         """The lines, corrected for a wobble (pitch, roll) of the mount."""
@@ -82,9 +84,11 @@ def sight(
         )(endpoints_image, jnp.zeros(2))
         by_pixel = by_pixel.reshape(2, 4)
         propagated = noise * sensor.pixel_sigma**2 * by_pixel @ by_pixel.T
-        return endpoints, line, some, propagated, by_tilt
+        area2 = determinant_2x2(by_pixel @ by_pixel.T)
+        log_area = 0.5 * jnp.log(jnp.where(area2 > 0, area2, 1))
+        return endpoints, line, some, propagated, by_tilt, log_area
 
-    endpoints, line, some, covariance, tilt = jax.vmap(one)(segments_image.endpoints)
+    endpoints, line, some, covariance, tilt, log_area = jax.vmap(one)(segments_image.endpoints)
     if not sensor.propagate:
         constant = jnp.array([sensor.rho_sigma, sensor.theta_sigma]) ** 2
         covariance = jnp.broadcast_to(jnp.diag(constant), covariance.shape)
@@ -92,7 +96,8 @@ def sight(
     has_length = (segments_image.endpoints[:, 0] != segments_image.endpoints[:, 1]).any(axis=-1)
     some = some & has_length & (covariance[:, 1, 1] < sensor.theta_limit**2)
     # what is reported at the nominal tilt moves against the correction
-    return Sightings(endpoints, some & segments_image.valid, line, covariance, -tilt)
+    some = some & segments_image.valid
+    return Sightings(endpoints, some, line, covariance, -tilt, log_area)
 
 
 def adapt_noise(
@@ -158,13 +163,7 @@ def compare(
       candidates are given: near the origin, where the polar form is accurate.
     - `used`: which sightings count, of each particle's own SoF extraction.
     """
-    n = jnp.stack([-jnp.sin(candidates.line.theta), jnp.cos(candidates.line.theta)], axis=-1)
-    seen = PolarLine(
-        candidates.line.rho - candidates.kappa * (n @ T_predicted_foot.xy),
-        candidates.line.theta - T_predicted_foot.yaw,
-    )
-    observed = PolarLine(sightings.line.rho[:, None], sightings.line.theta[:, None])
-    difference = polar_difference(observed, seen)
+    difference = _difference(sightings, candidates, T_predicted_foot)
     loose = mahalanobis(difference, candidates.precision_tilt)
     loose = jnp.where(candidates.valid, loose, jnp.inf)
     choice = loose.argmin(axis=1)
@@ -173,9 +172,83 @@ def compare(
 
     d = jnp.where(inlier[:, None], pick(difference), 0)
     W = jnp.where(inlier[:, None, None], pick(candidates.precision), 0)
-    JW = jnp.swapaxes(sightings.tilt, -1, -2) @ W
-    information = jnp.sum(JW @ sightings.tilt, axis=0)
-    gradient = jnp.sum((JW @ d[..., None])[..., 0], axis=0)
+    tilt, _, prior = _solve_tilt(sensor, sightings.tilt, d, W)
+    tight = mahalanobis(d - sightings.tilt @ tilt, W)
+    error = jnp.where(inlier, jnp.minimum(tight, sensor.e_max), sensor.e_max)
+    counted = used & sightings.valid
+    log_likelihood = -0.5 * (jnp.sum(jnp.where(counted, error, 0)) + prior)
+    return Comparison(log_likelihood, choice, error, tilt)
+
+
+def log_density(
+    sensor: SensorModel,
+    sightings: Sightings,
+    candidates: Candidates,
+    T_predicted_foot: SE2,
+    known: Float[Array, "M"],
+    lines: Float[Array, ""],
+    log_elsewhere: Float[Array, ""],
+) -> Float[Array, ""]:
+    """log p(segments | pose), the soft form of `compare`, with its constants; to differentiate.
+
+    Each sighting is one of the map's lines with the probability `known`, any of them alike, and
+    anywhere in the image otherwise; the candidates stand for all lines, as the others are too far
+    away to matter. The density is that of the end points across the line, per pixel², so that it
+    falls when a sigma is too large or too small and compares different mounts. The wobble of the
+    tilt is integrated out, about the value that the candidates, each by its share, make most
+    likely: exactly, if the shares are certain.
+
+    **Arguments:**
+    - `known`: probabilities of the sightings, less than 1.
+    - `lines`: how many of the map's lines are in view.
+    - `log_elsewhere`: log density of a segment that is no line of the map, per pixel².
+    """
+    there = sightings.valid[:, None] & candidates.valid
+    difference = jnp.where(
+        there[..., None], _difference(sightings, candidates, T_predicted_foot), 0
+    )
+    log_area = jnp.where(sightings.valid, sightings.log_area, 0)[:, None]
+    known = known[:, None]
+    weights = jnp.concatenate([jnp.where(there, known / lines, 0), 1 - known], axis=1)
+    elsewhere = jnp.broadcast_to(log_elsewhere, known.shape)
+
+    def log_mixture(d, W):
+        log_normal = 0.5 * (jnp.log(determinant_2x2(W)) - mahalanobis(d, W)) - jnp.log(2 * jnp.pi)
+        each = jnp.concatenate([log_normal + log_area, elsewhere], axis=1)
+        return each, jax.nn.logsumexp(each, axis=1, b=weights)
+
+    W, W_tilt = (
+        jnp.where(there[..., None, None], a, jnp.eye(2))
+        for a in (candidates.precision, candidates.precision_tilt)
+    )
+    each, total = log_mixture(difference, W_tilt)
+    share = weights * jnp.exp(jnp.where(weights > 0, each - total[:, None], -jnp.inf))
+    J = jnp.broadcast_to(sightings.tilt[:, None], W.shape)
+    tilt, volume, prior = _solve_tilt(sensor, J, difference, share[:, :-1, None, None] * W)
+    _, total = log_mixture(difference - J @ tilt, W)
+    return jnp.sum(jnp.where(sightings.valid, total, 0)) - 0.5 * (prior + jnp.log(volume))
+
+
+def _difference(sightings, candidates, T_predicted_foot) -> Float[Array, "M C 2"]:
+    """(rho, theta) observed less expected from a hypothetical foot, of all candidates."""
+    n = jnp.stack([-jnp.sin(candidates.line.theta), jnp.cos(candidates.line.theta)], axis=-1)
+    seen = PolarLine(
+        candidates.line.rho - candidates.kappa * (n @ T_predicted_foot.xy),
+        candidates.line.theta - T_predicted_foot.yaw,
+    )
+    observed = PolarLine(sightings.line.rho[:, None], sightings.line.theta[:, None])
+    return polar_difference(observed, seen)
+
+
+def _solve_tilt(sensor, J, d, W):
+    """The most likely wobble of errors d = J tilt + noise, two unknowns; W their precisions.
+
+    **Returns:** tilt; det(I + variance A), by which it narrows its prior; tiltᵀ tilt / variance.
+    """
+    JW = jnp.swapaxes(J, -1, -2) @ W
+    over = tuple(range(d.ndim - 1))
+    information = jnp.sum(JW @ J, axis=over)
+    gradient = jnp.sum((JW @ d[..., None])[..., 0], axis=over)
     variance = sensor.tilt_sigma**2  # (I + variance A)^-1 variance b: right for variance = 0 too
     a, b, c = (
         1 + variance * information[0, 0],
@@ -183,11 +256,6 @@ def compare(
         1 + variance * information[1, 1],
     )
     g = variance * gradient
-    tilt = jnp.stack([c * g[0] - b * g[1], a * g[1] - b * g[0]]) / (a * c - b * b)
-
-    tight = mahalanobis(d - sightings.tilt @ tilt, W)
-    error = jnp.where(inlier, jnp.minimum(tight, sensor.e_max), sensor.e_max)
-    counted = used & sightings.valid
-    prior = jnp.sum(gradient * tilt) - tilt @ information @ tilt  # tiltᵀ tilt / variance
-    log_likelihood = -0.5 * (jnp.sum(jnp.where(counted, error, 0)) + prior)
-    return Comparison(log_likelihood, choice, error, tilt)
+    volume = a * c - b * b
+    tilt = jnp.stack([c * g[0] - b * g[1], a * g[1] - b * g[0]]) / volume
+    return tilt, volume, jnp.sum(gradient * tilt) - tilt @ information @ tilt

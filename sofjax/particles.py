@@ -16,12 +16,22 @@ class Particles(eqx.Module):
     bias: OdometerBias  # mean [N, 4]
     log_weight: Float[Array, "N"]  # normalised: logsumexp = 0
 
-    def take(self, index: Int[Array, "N"]) -> "Particles":
-        """The chosen particles, with equal weights."""
+    def take(self, index: Int[Array, "N"], credit: bool = False) -> "Particles":
+        """The chosen particles, with equal weights.
+
+        With `credit` these have the derivative of the log weights of the chosen, and through it
+        the next evidence what the choice owes to the weights: w / stop_gradient(w), by which its
+        derivative is right in the mean over the choices; Ścibior and Wood, Differentiable particle
+        filtering without modifying the forward pass, 2021.
+        """
         N = self.log_weight.shape[0]
         T = SE2(self.T_world_robot.xy[index], self.T_world_robot.yaw[index])
         bias = OdometerBias(self.bias.mean[index], self.bias.covariance)
-        return Particles(T, bias, jnp.full(N, -jnp.log(N), float))
+        log_weight = jnp.full(N, -jnp.log(N), float)
+        if credit:
+            chosen = self.log_weight[index]
+            log_weight += chosen - jax.lax.stop_gradient(chosen)
+        return Particles(T, bias, log_weight)
 
 
 def effective_size(log_weight: Float[Array, "N"]) -> Float[Array, ""]:

@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sofjax.association import Association
+from sofjax.association import Association, gate_probability
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-from sofjax.likelihood import SensorModel, adapt_noise, compare, sight
+from sofjax.likelihood import SensorModel, adapt_noise, compare, log_density, sight
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions
 from sofjax.observation import Observation
 from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
@@ -23,9 +23,10 @@ from sofjax.segment_map import (
     is_raised,
     propose,
 )
-from sofjax.sof import extract
+from sofjax.sof import SofExtraction, extract
 
 LOST_AFTER = 10  # images without one known segment
+KNOWN = 0.5  # prior probability that a segment on the floor is one of the map; of the soft form
 
 
 class FilterRules(eqx.Module):
@@ -37,6 +38,7 @@ class FilterRules(eqx.Module):
     gate_each: bool = eqx.field(
         static=True, default=False
     )  # Fig. 6, step 4: SoF for every particle
+    soft: bool = eqx.field(static=True, default=False)  # densities to differentiate; see `run`
     max_depth: float = 8.0  # metres: farther segments are not used
 
 
@@ -134,9 +136,10 @@ def step(
     sof = lambda T: extract(
         config.association, camera, mount, view.segments_image, observation.segments_image,
         view.T_world_robot.between(T), config.filter.max_depth,
-    ).is_floor  # fmt: skip
-    is_sof = sof(predicted)
-    used = jax.vmap(sof)(T_world_robot) if config.filter.gate_each else sightings.valid[None]
+    )  # fmt: skip
+    is_sof = sof(predicted).is_floor
+    gate = lambda T: _gate(config, sof(T))
+    used = jax.vmap(gate)(T_world_robot) if config.filter.gate_each else sightings.valid[None]
     used = jnp.broadcast_to(used, (N, used.shape[1]))
 
     # 5) compare with the map by the sensor model, and choose
@@ -144,7 +147,12 @@ def step(
     candidates, slot, nearest = propose(rules, sensor, state.segment_map, sightings, T_world_foot)
     feet = T_world_foot.inverse() @ (T_world_robot @ mount.T_robot_foot)
     of_pose = lambda T, use: compare(sensor, sightings, candidates, T, use)
-    log_likelihood = jax.vmap(lambda T, use: of_pose(T, use).log_likelihood)(feet, used)
+    if config.filter.soft:
+        lines = in_view(rules, camera, mount, state.segment_map, predicted).sum()
+        of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, lines)
+        log_likelihood = jax.vmap(of_soft)(feet, used)
+    else:
+        log_likelihood = jax.vmap(lambda T, use: of_pose(T, use).log_likelihood)(feet, used)
     log_weight = moved.log_weight + log_likelihood
     log_evidence = jax.nn.logsumexp(log_weight)
     weighted = Particles(T_world_robot, bias, log_weight - log_evidence)
@@ -154,13 +162,13 @@ def step(
         chosen = mean_pose(particles)
     else:
         chosen = mean_pose(weighted)
-        resampled = weighted.take(systematic(key_choice, weighted.log_weight))
+        resampled = weighted.take(systematic(key_choice, weighted.log_weight), config.filter.soft)
         few = size < config.filter.effective_share * N
         particles = jax.tree.map(lambda a, b: jnp.where(few, a, b), resampled, weighted)
 
     # 6) integrate the observed segments into the map, as seen from the chosen pose
     T_world_foot_chosen = chosen @ mount.T_robot_foot
-    counted = sof(chosen) if config.filter.gate_each else sightings.valid
+    counted = sof(chosen).is_floor if config.filter.gate_each else sightings.valid
     best = of_pose(T_world_foot.between(T_world_foot_chosen), counted)
     known = counted & (best.error < sensor.e_max)
     new = is_sof & (nearest > sensor.e_max) & counted & ~known
@@ -205,12 +213,46 @@ def run(
 ) -> tuple[SlamState, StepInfo]:
     """A whole log as one scan: the same as `step` for one image after the other.
 
+    With `config.filter.soft` the sum of `info.log_evidence` is the log-evidence of the drive, a
+    density whose constants are all there, with derivatives by the settings of motion and sensor,
+    by the mount, and with `gate_each` by alpha, beta, Theta and its temperature in eq. (9). Going
+    back keeps one state a step and works the rest out again.
+
+    Which derivatives are right: with the random numbers fixed, and as long as none is resampled,
+    it is that of the function to the last digit. What resampling owes to the weights is credited
+    (`Particles.take`), so that for a given map the derivative of the evidence is unbiased and that
+    of its logarithm off by 1/N, at the price of noise: use the mean of several keys. Biased by
+    what it leaves out is how the map's decisions depend on the settings (what is born, known,
+    merged, raised or forgotten; when the noise adapts) and the paper's choice "winner".
+    By `e_max`, and by whatever else only decides, it is zero.
+
     **Arguments:**
     - `observations`: leaves with a leading axis T.
 
     **Returns:** the last state, and the infos with a leading axis T.
     """
-    return jax.lax.scan(lambda s, o: step(config, camera, mount, s, o), state, observations)
+    one = lambda state, observation: step(config, camera, mount, state, observation)
+    one = jax.checkpoint(one, prevent_cse=False)  # True gave wrong gradients under jit
+    return jax.lax.scan(one, state, observations)
+
+
+def _gate(config: SlamConfig, found: SofExtraction) -> Array:
+    """Which segments are on the floor, or if soft, how probably."""
+    if not config.filter.soft:
+        return found.is_floor
+    return jnp.where(
+        found.segments_robot.valid, gate_probability(config.association, found.matches.error), 0
+    )
+
+
+def _log_density(config, camera, sightings, candidates, T_predicted_foot, floor, lines):
+    """Of one pose, by the probabilities [M] of lying on the floor and the lines in view."""
+    elsewhere = -jnp.log(float(camera.width * camera.height))  # its ends anywhere in the image
+    lines = jnp.maximum(lines, 1).astype(float)
+    known = KNOWN * floor
+    return log_density(
+        config.sensor, sightings, candidates, T_predicted_foot, known, lines, elsewhere
+    )
 
 
 def _far_enough(config: Association, view: View, T_world_robot: SE2) -> Bool[Array, ""]:

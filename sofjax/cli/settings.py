@@ -22,6 +22,7 @@ LIMITS = {
     "filter.particles": (1, 1_000_000),
     "segment_map.capacity": (8, 65_536),
     "segment_map.candidates": (1, 8),
+    "association.temperature": (1e-3, 1e3),
 }
 
 
