@@ -56,7 +56,7 @@ def propose(
     if rules.directed:
         possible = possible & (jnp.abs(wrap(observed.theta - lines.theta)) < jnp.pi / 2)
     error = jnp.where(possible, error, jnp.inf)
-    best, slot = jax.lax.top_k(-error, rules.candidates)
+    best, slot = _smallest(error, rules.candidates)
     far = rename_covariance(far[slot], jnp.take_along_axis(side, slot, axis=1))
     S = sightings.covariance[:, None] + far
     candidates = Candidates(
@@ -66,4 +66,17 @@ def propose(
         precision_tilt=inverse_2x2(S + tilting[:, None]),
         valid=jnp.isfinite(best),
     )
-    return candidates, slot, -best[:, 0]
+    return candidates, slot, best[:, 0]
+
+
+def _smallest(
+    error: Float[Array, "M K"], count: int
+) -> tuple[Float[Array, "M C"], Int[Array, "M C"]]:
+    """The few smallest of each row in order, and where: so few that sorting all costs more."""
+    best, where = [], []
+    for _ in range(count):
+        at = error.argmin(axis=1, keepdims=True)
+        best.append(jnp.take_along_axis(error, at, axis=1))
+        where.append(at)
+        error = jnp.where(jnp.arange(error.shape[1]) == at, jnp.inf, error)
+    return jnp.concatenate(best, axis=1), jnp.concatenate(where, axis=1)
