@@ -1,0 +1,13 @@
+"""Where the camera sits on the robot, from what it sees while driving."""
+
+from sofjax.calibration.fit import CalibrationResult as CalibrationResult
+from sofjax.calibration.fit import FitRules as FitRules
+from sofjax.calibration.fit import fit_mount as fit_mount
+from sofjax.calibration.pairs import UNKNOWNS as UNKNOWNS
+from sofjax.calibration.pairs import PairNoise as PairNoise
+from sofjax.calibration.pairs import Pairs as Pairs
+from sofjax.calibration.pairs import distances as distances
+from sofjax.calibration.pairs import expected as expected
+from sofjax.calibration.rounds import DriveFit as DriveFit
+from sofjax.calibration.rounds import DriveRules as DriveRules
+from sofjax.calibration.rounds import fit_drive as fit_drive

@@ -1,0 +1,192 @@
+"""The mount by least squares over pairs, and what it cannot know."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from sofjax.calibration.pairs import (
+    UNKNOWNS,
+    Estimate,
+    Pairs,
+    U,
+    all_distances,
+    start_at,
+)
+from sofjax.geometry.camera import Camera, Mount
+
+MOUNT = ("height", "pitch", "roll")  # what is free unless told otherwise
+
+
+class FitRules(eqx.Module):
+    """What is free, what is known beforehand, and when an answer is one."""
+
+    free: tuple[str, ...] = eqx.field(static=True, default=MOUNT)  # of UNKNOWNS
+    # standard deviations: log height, pitch, roll, yaw in radians, log distance, log turn
+    prior_sigma: tuple[float, ...] = (3.0, 1.0, 1.0, 1.0, 0.02, 0.05)
+    loss_scale: float = 2.0  # residuals, in sigmas, from which they count linearly only
+    limit: tuple[float, ...] = (0.05, 0.02, 0.02, 0.02, 0.05, 0.1)  # sigma of an answer at most
+    pixel_sigma: float = 0.5  # noise of the end points that what seems to be known is held against
+    min_pairs: int = 20
+
+
+class CalibrationResult(eqx.Module):
+    """A fitted mount, and how sure it is."""
+
+    mount: Mount
+    odometer: Float[Array, "2"]  # true / read, of distance and of turning; 1 where not free
+    covariance: Float[Array, "6 6"]  # of UNKNOWNS, in metres, radians and shares; 0 if not free
+    residuals: Float[Array, "N 4"]  # pixels; 0 where a pair is not valid
+    observable: Bool[Array, "6"]  # whether each of UNKNOWNS was free and the pairs fix it
+    blind: Float[Array, "6"]  # the direction that is known least, in shares of `limit`, a unit ...
+    blindness: Float[Array, ""]  # ... and its standard deviation in the same; > 1 is no answer
+    cost: Float[Array, ""]  # half the sum of robust squares, in sigmas
+    result: optx.RESULTS  # of the solver; an estimate that did not converge is the best so far
+
+
+def robust(r: Float[Array, "4"], scale: Float[Array, ""] | float) -> Float[Array, "4"]:
+    """Residuals whose square grows as |r| beyond `scale`, smooth everywhere (pseudo-Huber).
+
+    The four distances of a pair are two equations said from both sides: they count half.
+    """
+    return r * jnp.sqrt(1 / (1 + jnp.sqrt(1 + jnp.sum(r**2) / 2 / scale**2)))
+
+
+def fit_mount(
+    camera: Camera, mount: Mount, pairs: Pairs, rules: FitRules = FitRules(), max_steps: int = 60
+) -> CalibrationResult:
+    """Find the mount that carries the floor's lines from image to image; Levenberg-Marquardt.
+
+    Pure; `jax.vmap` runs it over logs and over starts, and its estimate has derivatives by all of
+    `camera`, `pairs` and the mount's lever arm, by the implicit function theorem. Wants float64.
+
+    Only the height over the odometer's scale of distance can be seen: with 'distance' free too,
+    the priors share the two out.
+
+    **Arguments:**
+    - `mount`: where to begin, and the middle of the priors; what is not free stays as it is.
+    - `pairs`: associations and sigmas, which stay as they are.
+    """
+    is_free = jnp.array([name in rules.free for name in UNKNOWNS])
+    numbers = map(jnp.asarray, (rules.prior_sigma, rules.limit, rules.loss_scale, rules.min_pairs,
+                                rules.pixel_sigma))  # fmt: skip
+    return _fit(camera, mount, pairs, is_free, *numbers, max_steps)
+
+
+@eqx.filter_jit  # one program, whatever is free
+def _fit(camera, mount, pairs, is_free, prior, limit, loss_scale, min_pairs, pixel_sigma, max_steps):
+    start = start_at(mount)
+
+    def residuals(by, pairs):
+        by = jnp.where(is_free, by, 0)
+        r = all_distances(camera, start.moved(by), pairs) / pairs.sigma
+        r = jnp.where(pairs.valid[:, None], r, 0)
+        return jax.vmap(robust, in_axes=(0, None))(r, loss_scale)
+
+    def with_priors(by, _):
+        return residuals(by, pairs), jnp.where(is_free, by / prior, by)
+
+    found = optx.least_squares(
+        with_priors,
+        optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8, linear_solver=lx.Normal(lx.Cholesky())),
+        jnp.zeros(U),
+        max_steps=max_steps,
+        throw=False,
+    )
+    by = jnp.where(is_free, found.value, 0)
+    estimate = start.moved(by)
+    covariance = jnp.where(
+        is_free[:, None] & is_free, _sandwich(residuals, by, pairs, prior, pixel_sigma), 0
+    )
+    spread, direction, sure = _blindness(limit, covariance)
+    enough = jnp.sum(pairs.valid) >= min_pairs
+    unit = jnp.ones(U).at[0].set(estimate.mount.height)  # log height to metres
+    r, known = with_priors(by, None)
+    return CalibrationResult(
+        mount=estimate.mount,
+        odometer=jnp.stack([estimate.distance, estimate.turn]),
+        covariance=covariance * jnp.outer(unit, unit),
+        residuals=jnp.where(pairs.valid[:, None], all_distances(camera, estimate, pairs), 0),
+        observable=is_free & sure & enough,
+        blind=direction,
+        blindness=spread,
+        cost=0.5 * (jnp.sum(r**2) + jnp.sum(known**2)),
+        result=found.result,
+    )
+
+
+def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "6 6"]:
+    """Covariance of the estimate from how the clusters disagree: A^-1 (Σ g gᵀ) A^-1.
+
+    Errors of pairs that share images, a line or an odometer's reading are correlated, and the
+    inverse information alone is too small by much. `g` is each cluster's gradient at the estimate,
+    as it would be without that cluster's own pull on it (the jackknife).
+
+    Noise turns segments that tell nothing into some that seem to tell a little, and if all there
+    is is noise then that adds up: what jittered segments would tell is not counted in A.
+    """
+    jacobian = jax.jacfwd(residuals)
+    J, r = jacobian(by, pairs), residuals(by, pairs)
+    K = jnp.diag(1 / prior)
+    A = jnp.einsum("nri,nrj->ij", J, J) + K @ K
+    by_cluster = lambda x: jax.ops.segment_sum(x, pairs.cluster, len(x))
+    g = by_cluster(jnp.einsum("nri,nr->ni", J, r))
+    own = by_cluster(jnp.einsum("nri,nrj->nij", J, J))
+    g = jax.vmap(lambda own, g: A @ jnp.linalg.solve(A - own, g))(own, g)  # (1 - own A^-1)^-1 g
+    middle = g.T @ g + K @ K
+
+    keys = jax.random.split(jax.random.key(0))
+    jitter = [pixel_sigma * jax.random.rademacher(k, pairs.first.shape, float) for k in keys]
+    jittered = eqx.tree_at(
+        lambda p: (p.first, p.second), pairs, (pairs.first + jitter[0], pairs.second + jitter[1])
+    )
+    L = jnp.linalg.cholesky(A)
+    told = jacobian(by, jittered) - J
+    told = jnp.einsum("nri,nrj->ij", told, told)
+    from_left = lambda M: jax.scipy.linalg.solve_triangular(L, M, lower=True)
+    share, axes = jnp.linalg.eigh(from_left(from_left(told).T))
+    root = from_left(jnp.eye(U)).T @ axes / (1 - jnp.clip(share, 0, 0.99))
+    P = root @ axes.T @ from_left(jnp.eye(U))
+    return P @ middle @ P.T
+
+
+def _blindness(limit, covariance):
+    """The widest direction of the covariance in units of what an answer may have at most."""
+    values, vectors = jnp.linalg.eigh(covariance / jnp.outer(limit, limit))
+    spread = jnp.sqrt(jnp.maximum(values[-1], 0))
+    return spread, vectors[:, -1], jnp.diag(covariance) < limit**2
+
+
+def verdict(found: CalibrationResult, rules: FitRules, pairs: Pairs) -> tuple[bool, str]:
+    """Whether a fit is an answer, and in words what could not be observed."""
+    count, limit = int(pairs.valid.sum()), rules.limit
+    if count < rules.min_pairs:
+        return False, (
+            f"{count} pairs of segments on the floor were found, and {rules.min_pairs} are needed: "
+            "the drive shows too few lines on the floor, or is too short"
+        )
+    sigma = jnp.sqrt(jnp.diag(found.covariance)).at[0].divide(found.mount.height)
+    wide = [
+        f"the {name} ({_amount(name, float(s))})"
+        for name, s, most in zip(UNKNOWNS, sigma, limit, strict=True)
+        if name in rules.free and s > most
+    ]
+    if wide:
+        return False, f"not observable from this drive: {' and '.join(wide)}; {_WHY}"
+    if found.result != optx.RESULTS.successful:
+        return False, "the fit did not converge"
+    return True, ""
+
+
+_WHY = (
+    "the height takes driving some metres, not turning on the spot, over lines that lie across the "
+    "way, and the tilt lines that come nearer"
+)
+
+
+def _amount(name: str, sigma: float) -> str:
+    if name in ("height", "distance", "turn"):
+        return f"known to {100 * sigma:.2g} %"
+    return f"known to {sigma * 57.29578:.2g}°"

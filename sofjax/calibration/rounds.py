@@ -1,0 +1,104 @@
+"""From a drive's segments to its mount: follow, relate, fit, and again with what was learnt."""
+
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sofjax.calibration.fit import CalibrationResult, FitRules, fit_mount
+from sofjax.calibration.heights import FloorRules, on_floor
+from sofjax.calibration.pairs import Estimate, PairNoise, Pairs, expected, start_at
+from sofjax.calibration.tracks import TrackRules, follow, relate
+from sofjax.geometry.camera import Camera, Mount
+from sofjax.observation import Observation
+
+# height times, and radians of pitch more: where else to begin
+STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
+SEARCH, REFINE = 3, 2  # rounds from each start, and from the place where most of them end
+FREELY = 2  # rounds before lines are told by their height
+
+
+@dataclass(frozen=True)
+class DriveRules:
+    """All settings of `fit_drive`."""
+
+    track: TrackRules = field(default_factory=TrackRules)
+    noise: PairNoise = field(default_factory=PairNoise)
+    floor: FloorRules = field(default_factory=FloorRules)
+    fit: FitRules = field(default_factory=lambda: FitRules(free=("height", "pitch", "roll", "turn")))
+    capacity: int = 4096  # pairs
+    same_height: float = 0.03  # share of the height by which two ends are one place
+    same_angle: float = 0.01  # radians
+
+
+@dataclass(frozen=True)
+class DriveFit:
+    """A drive's mount from pairs alone."""
+
+    fit: CalibrationResult
+    pairs: Pairs  # valid where they were taken for floor
+    line: Int[Array, "N"]  # the number of each pair's line
+    related: int  # pairs before those that are not floor were left out
+    ends: Float[np.ndarray, "starts 3"]  # height, pitch, roll where each start ended
+    agreeing: int  # how many of them ended in the same place
+
+
+def fit_drive(
+    camera: Camera, mount: Mount, log: Observation, rules: DriveRules | None = None
+) -> DriveFit:
+    """The mount of one drive; wants float64.
+
+    Associations stay as they are in a solve and are made anew between two. The rounds begin at
+    the given mount and at four others far from it; the answer is where most of them end.
+
+    **Arguments:**
+    - `mount`: roughly.
+    """
+    rules = rules or DriveRules()
+    searched = [_rounds(camera, start, log, rules, SEARCH, 0) for start in starts(mount, rules)]
+    ends = np.array([_place(found.fit.mount) for found in searched])
+    same = np.abs(ends[:, None] - ends) < [rules.same_height * np.median(ends[:, 0]),
+                                           rules.same_angle, rules.same_angle]  # fmt: skip
+    agreeing = same.all(-1).sum(1)
+    best = int(np.lexsort((-np.array([f.pairs.valid.sum() for f in searched]), -agreeing))[0])
+    found = _rounds(camera, searched[best].fit.mount, log, rules, REFINE, FREELY)
+    return DriveFit(
+        found.fit, found.pairs, found.line, found.related, ends, int(agreeing[best])
+    )
+
+
+def starts(mount: Mount, rules: DriveRules) -> list[Mount]:
+    """The mount, and others with what is free far from it."""
+    free = rules.fit.free
+    there = []
+    for times, more in STARTS:
+        by = jnp.zeros(6).at[0].set(jnp.log(times) if "height" in free else 0.0)
+        there.append(start_at(mount).moved(by.at[1].set(more if "pitch" in free else 0.0)).mount)
+    return there
+
+
+def _place(mount: Mount) -> Float[np.ndarray, "3"]:
+    return np.array([mount.height, mount.pitch, mount.roll], float)
+
+
+def _rounds(
+    camera: Camera, mount: Mount, log: Observation, rules: DriveRules, rounds: int, begin: int
+) -> DriveFit:
+    """Some rounds, counted from `begin`."""
+    estimate = start_at(mount)
+    for count in range(begin, begin + rounds):
+        track = follow(rules.track, camera, estimate, log)
+        height = float(estimate.mount.height)
+        pairs, line = relate(rules.track, log, track, height, rules.capacity)
+        sigma = expected(rules.noise, camera, estimate, pairs)
+        pairs = eqx.tree_at(lambda p: p.sigma, pairs, sigma)
+        related = int(pairs.valid.sum())
+        if count >= FREELY:
+            floor = on_floor(rules.floor, camera, estimate, pairs, line)
+            pairs = eqx.tree_at(lambda p: p.valid, pairs, floor)
+        fit = fit_mount(camera, estimate.mount, pairs, rules.fit)
+        estimate = Estimate(fit.mount, fit.odometer[0], fit.odometer[1])
+    return DriveFit(fit, pairs, line, related, np.zeros((0, 3)), 0)
