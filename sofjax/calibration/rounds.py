@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sofjax.calibration.fit import CalibrationResult, FitRules, fit_mount
+from sofjax.calibration.fit import CalibrationResult, FitRules, fit_mount, verdict
 from sofjax.calibration.heights import FloorRules, on_floor
-from sofjax.calibration.pairs import Estimate, PairNoise, Pairs, expected, start_at
+from sofjax.calibration.pairs import U, Estimate, PairNoise, Pairs, expected, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.observation import Observation
@@ -45,6 +45,27 @@ class DriveFit:
     ends: Float[np.ndarray, "starts 3"]  # height, pitch, roll where each start ended
     agreeing: int  # how many of them ended in the same place
 
+    @property
+    def covariance(self) -> Float[np.ndarray, "6 6"]:
+        """That of the fit, and where the starts ended besides."""
+        spread = np.zeros((6, 6))
+        spread[:3, :3] = np.cov(self.ends.T)
+        return np.asarray(self.fit.covariance) + spread
+
+    def verdict(self, rules: "DriveRules") -> tuple[bool, str]:
+        """Whether this is an answer, and a sentence on why not."""
+        usable, why = verdict(self.fit, rules.fit, self.pairs)
+        starts = len(self.ends)
+        if usable and 2 * self.agreeing <= starts:
+            low, high = self.ends.min(0), self.ends.max(0)
+            angle = np.degrees([low[1], high[1]])
+            usable, why = False, (
+                f"ambiguous: from {starts} starts the fit ends in different places, heights from "
+                f"{low[0]:.3f} to {high[0]:.3f} m and pitches from {angle[0]:.1f} to "
+                f"{angle[1]:.1f}°"
+            )
+        return usable, why
+
 
 def fit_drive(
     camera: Camera, mount: Mount, log: Observation, rules: DriveRules | None = None
@@ -75,7 +96,7 @@ def starts(mount: Mount, rules: DriveRules) -> list[Mount]:
     free = rules.fit.free
     there = []
     for times, more in STARTS:
-        by = jnp.zeros(6).at[0].set(jnp.log(times) if "height" in free else 0.0)
+        by = jnp.zeros(U).at[0].set(jnp.log(times) if "height" in free else 0.0)
         there.append(start_at(mount).moved(by.at[1].set(more if "pitch" in free else 0.0)).mount)
     return there
 

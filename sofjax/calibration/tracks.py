@@ -129,8 +129,8 @@ def relate(
     - `height`: of the camera, metres, roughly.
     - `capacity`: N; if there are more pairs, they are thinned out evenly.
 
-    **Returns:** pairs with unit sigmas, those of one first image a cluster; and the number of each
-    pair's line, from 0 to N - 1, and -1 where there is none.
+    **Returns:** pairs with unit sigmas, those of one stretch of the way a cluster; and the number
+    of each pair's line, from 0 to N - 1, and -1 where there is none.
     """
     endpoints = np.asarray(log.segments_image.endpoints, float)
     poses = jax.device_get(path(log.motion, jnp.ones(3)))
@@ -170,7 +170,12 @@ def relate(
         T_first_second=jax.tree.map(lambda x: pad(np.asarray(x)), at(a).between(at(b))),
         valid=jnp.arange(capacity) < len(chosen),
         sigma=jnp.ones((capacity, 4)),
-        cluster=pad(np.unique(t[a], return_inverse=True)[1]),
+        cluster=pad(_stretches(way[t[a]], way[-1], rules.longest)),
     )
     return pairs, pad(line, -1)
 
+
+def _stretches(at: Float[np.ndarray, "N"], whole: float, length: float) -> Int[np.ndarray, "N"]:
+    """Which stretch of the way each place is in: `length` long, and ten at least."""
+    length = max(min(length, whole / 10), 1e-9)
+    return np.unique((at / length).astype(int), return_inverse=True)[1]

@@ -13,3 +13,4 @@ from sofjax.vision.images import read_image as read_image
 from sofjax.vision.lens import Lens as Lens
 from sofjax.vision.observe import observation as observation
 from sofjax.vision.observe import observe_drive as observe_drive
+from sofjax.vision.rectify import rectify as rectify
