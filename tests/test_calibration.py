@@ -8,7 +8,7 @@ import optimistix as optx
 import pytest
 from conftest import make_camera
 
-from sofjax.calibration import FitRules, PairNoise, Pairs, UNKNOWNS, distances, expected, fit_mount
+from sofjax.calibration import UNKNOWNS, FitRules, PairNoise, Pairs, distances, expected, fit_mount
 from sofjax.calibration.fit import verdict
 from sofjax.calibration.heights import FloorRules, on_floor
 from sofjax.calibration.pairs import start_at
@@ -43,7 +43,9 @@ def off(mount, times=1.0, pitch=0.0, roll=0.0):
 
 def seen(camera, mount, pose, points):
     """World points [N, 2, 3] in an image, pixels, by the plain projection."""
-    P = np.asarray(projection_matrix(camera, mount, SE2(jnp.asarray(pose[:2]), jnp.asarray(pose[2]))))
+    P = np.asarray(
+        projection_matrix(camera, mount, SE2(jnp.asarray(pose[:2]), jnp.asarray(pose[2])))
+    )
     x = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1) @ P.T
     assert (x[..., 2] > 0).all()
     return x[..., :2] / x[..., 2:]
@@ -51,7 +53,9 @@ def seen(camera, mount, pose, points):
 
 def make_pairs(camera, mount, rng, motion=None, angle=None, noise=0.0, z=0.0):
     """N lines of the floor, each seen before and after a motion of its own."""
-    first = np.stack([rng.uniform(-0.2, 0.2, N), rng.uniform(-0.1, 0.1, N), rng.uniform(-1, 1, N)], 1)
+    first = np.stack(
+        [rng.uniform(-0.2, 0.2, N), rng.uniform(-0.1, 0.1, N), rng.uniform(-1, 1, N)], 1
+    )
     if motion is None:
         motion = np.stack(
             [rng.uniform(0.3, 0.9, N), rng.normal(0, 0.02, N), rng.normal(0, 0.05, N)], axis=1
@@ -62,14 +66,17 @@ def make_pairs(camera, mount, rng, motion=None, angle=None, noise=0.0, z=0.0):
     middle = np.stack([rng.uniform(1.7, 4, N), rng.uniform(-0.8, 0.8, N)], axis=1)
     angle = rng.uniform(0, np.pi, N) if angle is None else angle
     along = rng.uniform(0.15, 0.4, N)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    ends = np.asarray(T1.apply(jnp.asarray(np.stack([middle - along, middle + along])))).swapaxes(0, 1)
+    ends = np.asarray(T1.apply(jnp.asarray(np.stack([middle - along, middle + along])))).swapaxes(
+        0, 1
+    )
     height = np.broadcast_to(z, N)[:, None, None] * np.ones((N, 2, 1))
     points = np.concatenate([ends, height], axis=-1)
     images = []
     for T in (T1, T2):
         poses = np.concatenate([np.asarray(T.xy), np.asarray(T.yaw)[:, None]], axis=1)
         images.append(np.concatenate([
-            seen(camera, mount, pose, point[None]) for pose, point in zip(poses, points, strict=True)
+            seen(camera, mount, pose, point[None])
+            for pose, point in zip(poses, points, strict=True)
         ]))  # fmt: skip
     images = [image + rng.normal(0, noise, image.shape) for image in images]
     return Pairs(*map(jnp.asarray, images), T12, jnp.ones(N, bool), jnp.ones((N, 4)), jnp.arange(N))
@@ -179,7 +186,7 @@ def test_height_and_the_odometer_s_scale_are_one(camera, mount, rng):
 
 
 def implicit(camera, mount, pairs):
-    """The fitted (height, pitch, roll) as a function of one end point, the focal length, the way."""
+    """The fitted (height, pitch, roll) by one end point, the way driven and the focal length."""
 
     def fitted(x):
         moved = eqx.tree_at(lambda p: p.second, pairs, pairs.second.at[3, 0].add(x[:2]))
@@ -205,15 +212,19 @@ def test_the_derivative_of_the_fit_is_that_of_finite_differences(camera, mount, 
 
 
 def test_truth_lies_within_the_error_bars_and_the_error_is_near_the_bound(camera, mount):
-    """Two hundred logs at once: near the Cramér-Rao bound, and inside 2 sigma as often as it must."""
+    """Two hundred logs: near the Cramér-Rao bound, and inside 2 sigma as often as it must."""
     rng = np.random.default_rng(3)
     clean = make_pairs(camera, mount, rng)
     draws = jnp.asarray(rng.normal(0, 0.5, (2, 200, N, 2, 2)))
 
     def one(a, b):
-        pairs = eqx.tree_at(lambda p: (p.first, p.second), clean, (clean.first + a, clean.second + b))
+        pairs = eqx.tree_at(
+            lambda p: (p.first, p.second), clean, (clean.first + a, clean.second + b)
+        )
         found = fit_mount(camera, mount, weighed(camera, mount, pairs))
-        return jnp.stack([found.mount.height, found.mount.pitch, found.mount.roll]), found.covariance
+        return jnp.stack(
+            [found.mount.height, found.mount.pitch, found.mount.roll]
+        ), found.covariance
 
     got, covariance = jax.vmap(one)(*draws)
     error = np.asarray(got) - list(FIT.values())
@@ -230,7 +241,7 @@ def cramer_rao(camera, mount, pairs, sigma):
     """
     information = np.zeros((3, 3))
     for k in range(N):
-        T = jax.tree.map(lambda x: x[k], pairs.T_first_second)
+        T = jax.tree.map(lambda x, k=k: x[k], pairs.T_first_second)
 
         def of(by, first, second, T=T):
             moved = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(3)]))
@@ -242,7 +253,8 @@ def cramer_rao(camera, mount, pairs, sigma):
     return np.sqrt(np.diag(np.linalg.inv(information))) * [float(mount.height), 1, 1]
 
 
-def sentence(camera, mount, pairs, rules=FitRules()):
+def sentence(camera, mount, pairs):
+    rules = FitRules()
     found = fit_mount(camera, mount, weighed(camera, mount, pairs), rules)
     usable, words = verdict(found, rules, pairs)
     assert not usable
@@ -270,7 +282,9 @@ def test_few_pairs_are_none(camera, mount, pairs):
     few = eqx.tree_at(lambda p: p.valid, pairs, jnp.arange(N) < 12)
     found, words = sentence(camera, mount, few)
     assert not found.observable.any() and "12 pairs" in words
-    found, words = sentence(camera, mount, eqx.tree_at(lambda p: p.valid, pairs, jnp.zeros(N, bool)))
+    found, words = sentence(
+        camera, mount, eqx.tree_at(lambda p: p.valid, pairs, jnp.zeros(N, bool))
+    )
     assert "0 pairs" in words and np.isfinite(value(found)).all()
 
 
@@ -302,7 +316,9 @@ def log(camera, mount, rng):
     valid = np.broadcast_to(np.arange(16) < 12, (40, 16)).copy()
     valid[20, np.flatnonzero(order[20] == 5)] = False
     motion = SE2(jnp.tile(jnp.array([[0.05, 0.0]]), (40, 1)).at[0].set(0), jnp.zeros(40))
-    log = Observation(Segments(jnp.asarray(endpoints), jnp.asarray(valid)), motion, jnp.zeros(40, int))
+    log = Observation(
+        Segments(jnp.asarray(endpoints), jnp.asarray(valid)), motion, jnp.zeros(40, int)
+    )
     return log, order
 
 

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 
 from sofjax.calibration.pairs import (
     UNKNOWNS,
-    Estimate,
     Pairs,
     U,
     all_distances,
@@ -30,6 +29,9 @@ class FitRules(eqx.Module):
     limit: tuple[float, ...] = (0.05, 0.02, 0.02, 0.02, 0.05, 0.1)  # sigma of an answer at most
     pixel_sigma: float = 0.5  # noise of the end points that what seems to be known is held against
     min_pairs: int = 20
+
+
+DEFAULT = FitRules()
 
 
 class CalibrationResult(eqx.Module):
@@ -55,7 +57,7 @@ def robust(r: Float[Array, "4"], scale: Float[Array, ""] | float) -> Float[Array
 
 
 def fit_mount(
-    camera: Camera, mount: Mount, pairs: Pairs, rules: FitRules = FitRules(), max_steps: int = 60
+    camera: Camera, mount: Mount, pairs: Pairs, rules: FitRules = DEFAULT, max_steps: int = 60
 ) -> CalibrationResult:
     """Find the mount that carries the floor's lines from image to image; Levenberg-Marquardt.
 
@@ -76,7 +78,9 @@ def fit_mount(
 
 
 @eqx.filter_jit  # one program, whatever is free
-def _fit(camera, mount, pairs, is_free, prior, limit, loss_scale, min_pairs, pixel_sigma, max_steps):
+def _fit(
+    camera, mount, pairs, is_free, prior, limit, loss_scale, min_pairs, pixel_sigma, max_steps
+):
     start = start_at(mount)
 
     def residuals(by, pairs):

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from sofjax.calibration.pairs import Estimate, Pairs, U, all_distances
 from sofjax.geometry.camera import Camera

@@ -7,8 +7,8 @@ from sofjax.calibration.pairs import UNKNOWNS
 from sofjax.geometry.camera import Mount
 
 SCALE = (
-    "only the height over the odometer's distances can be seen: an odometer that reads 1 % too much "
-    "makes the height 1 % too large"
+    "only the height over the odometer's distances can be seen: an odometer that reads 1 % too "
+    "much makes the height 1 % too large"
 )
 
 

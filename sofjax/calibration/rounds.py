@@ -3,14 +3,13 @@
 from dataclasses import dataclass, field
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sofjax.calibration.fit import CalibrationResult, FitRules, fit_mount, verdict
 from sofjax.calibration.heights import FloorRules, on_floor
-from sofjax.calibration.pairs import U, Estimate, PairNoise, Pairs, expected, start_at
+from sofjax.calibration.pairs import Estimate, PairNoise, Pairs, U, expected, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.observation import Observation
@@ -28,7 +27,9 @@ class DriveRules:
     track: TrackRules = field(default_factory=TrackRules)
     noise: PairNoise = field(default_factory=PairNoise)
     floor: FloorRules = field(default_factory=FloorRules)
-    fit: FitRules = field(default_factory=lambda: FitRules(free=("height", "pitch", "roll", "turn")))
+    fit: FitRules = field(
+        default_factory=lambda: FitRules(free=("height", "pitch", "roll", "turn"))
+    )
     capacity: int = 4096  # pairs
     same_height: float = 0.03  # share of the height by which two ends are one place
     same_angle: float = 0.01  # radians
@@ -59,10 +60,10 @@ class DriveFit:
         if usable and 2 * self.agreeing <= starts:
             low, high = self.ends.min(0), self.ends.max(0)
             angle = np.degrees([low[1], high[1]])
-            usable, why = False, (
-                f"ambiguous: from {starts} starts the fit ends in different places, heights from "
-                f"{low[0]:.3f} to {high[0]:.3f} m and pitches from {angle[0]:.1f} to "
-                f"{angle[1]:.1f}°"
+            usable = False
+            why = (
+                f"ambiguous: from {starts} starts the fit ends in different places, heights "
+                f"{low[0]:.3f} to {high[0]:.3f} m and pitches {angle[0]:.1f} to {angle[1]:.1f}°"
             )
         return usable, why
 
@@ -86,9 +87,7 @@ def fit_drive(
     agreeing = same.all(-1).sum(1)
     best = int(np.lexsort((-np.array([f.pairs.valid.sum() for f in searched]), -agreeing))[0])
     found = _rounds(camera, searched[best].fit.mount, log, rules, REFINE, FREELY)
-    return DriveFit(
-        found.fit, found.pairs, found.line, found.related, ends, int(agreeing[best])
-    )
+    return DriveFit(found.fit, found.pairs, found.line, found.related, ends, int(agreeing[best]))
 
 
 def starts(mount: Mount, rules: DriveRules) -> list[Mount]:

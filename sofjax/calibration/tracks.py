@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from sofjax.calibration.pairs import Estimate, Pairs
 from sofjax.geometry.angles import wrap
@@ -69,10 +69,9 @@ def _partners(rules: TrackRules, camera: Camera, estimate: Estimate, log: Observ
     def at(lag):
         def one(t):
             before = jnp.maximum(t - lag, 0)
-            a, b = (jax.tree.map(lambda x: x[i], floor) for i in (before, t))
-            T = jax.tree.map(lambda x: x[before], poses).between(
-                jax.tree.map(lambda x: x[t], poses)
-            )
+            at = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
+            a, b = at(floor, before), at(floor, t)
+            T = at(poses, before).between(at(poses, t))
             H = two_view_homography(camera, estimate.mount, T)
             of_pair = lambda x, y: miss(rules, H, x, y)
             off = jax.vmap(lambda y: jax.vmap(lambda x: of_pair(x, y))(a.endpoints))(b.endpoints)
@@ -102,7 +101,7 @@ def miss(
 
 @jax.jit
 def path(motion: SE2, scale: Float[Array, "3"]) -> SE2:
-    """Poses at the images by the odometer alone, its (forward, sideways, turn) times `scale`; [T]."""
+    """Poses [T] by the odometer alone, its (forward, sideways, turn) times `scale`."""
     steps = SE2.exp(motion.log() * scale[None])
 
     def step(T, moved):

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from sofjax.io.errors import InputError, nearest
 
 if TYPE_CHECKING:
-    from sofjax.calibration import DriveFit, DriveRules
+    from sofjax.calibration import DriveFit
     from sofjax.geometry import Mount
     from sofjax.io.camera_file import CameraFile
     from sofjax.io.drive import Drive
     from sofjax.observation import Observation
-    from sofjax.vision import Frontend
+    from sofjax.vision import Frontend, FrontendSettings
 
 REFUSED = 3  # exit code: all was read, and nothing can be known from it
 FREE = ("height", "pitch", "roll", "yaw", "distance", "turn")
@@ -60,7 +60,7 @@ def add_parser(parts: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, detect, fit, judge, draw, write."""
-    from sofjax.cli import outputs
+    from sofjax.cli import mount_figure, outputs
     from sofjax.io.drive import read_drive
     from sofjax.vision import FrontendSettings, check_images
 
@@ -74,13 +74,27 @@ def run(args: argparse.Namespace) -> int:
     outputs.check_writable(args.out.parent)
     found = calibrate(drive, FrontendSettings(), free, args.joint)
     print(found.summary)
-    draw(args.out.with_suffix(".png"), drive, found)
+    mount_figure.draw(args.out.with_suffix(".png"), drive, found)
     if not found.usable:
         print(f"{args.out} is not written")
         return REFUSED
     write(args.out, found)
     print(f"written to {args.out}")
     return 0
+
+
+def fit_before_run(drive: "Drive", settings: "FrontendSettings", folder: Path) -> "Calibration":
+    """What `sofjax run --calibrate` does first; camera file and figure go into its folder."""
+    from sofjax.cli import mount_figure, outputs
+
+    found = calibrate(drive, settings, free_names(BY_DEFAULT))
+    print(found.summary)
+    mount_figure.draw(folder / outputs.MOUNT, drive, found)
+    if found.usable:
+        write(folder / outputs.CAMERA, found)
+    else:
+        print("the drive is not run: measure the mount, or leave --calibrate out")
+    return found
 
 
 @dataclass(frozen=True)
@@ -131,7 +145,9 @@ def with_mount(drive: "Drive", mount: "Mount") -> "Drive":
     return dataclasses.replace(drive, camera_file=file)
 
 
-def calibrate(drive: "Drive", settings, free: tuple[str, ...], joint: bool = False) -> Calibration:
+def calibrate(
+    drive: "Drive", settings: "FrontendSettings", free: tuple[str, ...], joint: bool = False
+) -> Calibration:
     """Fit the mount to a drive.
 
     **Raises:** `InputError` if the robot never moves.
@@ -195,9 +211,8 @@ def calibrate(drive: "Drive", settings, free: tuple[str, ...], joint: bool = Fal
         "odometer": dict(zip(FREE[4:], odometer.tolist(), strict=True)),
         "observable": dict(zip(FREE, np.asarray(found.fit.observable).tolist(), strict=True)),
     }
-    file = dataclasses.replace(
-        drive.camera_file, mount=type(fitted)(*(jnp.asarray(v, float) for v in dataclasses.astuple(fitted)))
-    )  # fmt: skip
+    fields = (jnp.asarray(value, float) for value in dataclasses.astuple(fitted))
+    file = dataclasses.replace(drive.camera_file, mount=type(fitted)(*fields))
     notes = [f"mount from {drive.name}, {count}", *lines]
     return Calibration(file, usable, verdict, notes, "\n".join(print_lines), numbers, found)
 
@@ -249,76 +264,3 @@ def write(path: Path, found: Calibration) -> None:
         path, file.camera, file.distortion_model, file.distortion, file.name,
         {key: getattr(file.mount, key) for key in MOUNT_FIELDS}, found.notes,
     )  # fmt: skip
-
-
-def draw(path: Path, drive: "Drive", found: Calibration) -> None:
-    """The residuals, and the floor by the old and the new mount."""
-    import numpy as np
-
-    from sofjax import viewer
-
-    if not viewer.available():
-        print(viewer.MISSING)
-        return
-    valid = np.asarray(found.fit.pairs.valid)
-    if not valid.any():
-        return
-    old, new = _residuals(drive, found)
-    floors, extent = _floors(drive, found)
-    title = f"{drive.name}: {found.verdict}"
-    viewer.draw_mount(path, title, old[valid], new[valid], floors, extent)
-    print(f"drawn to {path}")
-
-
-def _residuals(drive: "Drive", found: Calibration):
-    import jax
-    import numpy as np
-
-    from sofjax.calibration.pairs import all_distances, start_at
-
-    with jax.enable_x64(True):
-        double = lambda tree: jax.tree.map(lambda a: jax.numpy.asarray(a, float), tree)
-        return [
-            np.asarray(all_distances(double(file.camera), start_at(double(file.mount)),
-                                     found.fit.pairs))
-            for file in (drive.camera_file, found.camera_file)
-        ]  # fmt: skip
-
-
-def _floors(drive: "Drive", found: Calibration):
-    """Two images a stretch of the way apart on the floor, by the old and the new mount."""
-    import numpy as np
-
-    from sofjax.vision import Frontend, read_image, rectify
-
-    height = float(found.camera_file.mount.height)
-    at = drive.odometry.at(drive.image_stamps)
-    first, second = _apart(at, 0.8 * height)
-    frontend = Frontend(drive.camera_file)
-    c, s = np.cos(at.yaw[first]), np.sin(at.yaw[first])
-    x, y = np.array([[c, s], [-s, c]]) @ (at.xy[second] - at.xy[first])
-    motion = np.array([x, y, at.yaw[second] - at.yaw[first]])
-    extent = (1.2 * height, 6.0 * height, -2.0 * height, 2.0 * height)
-    floors = []
-    for mount in (drive.camera_file.mount, found.camera_file.mount):
-        both = []
-        for i, T in ((first, np.zeros(3)), (second, motion)):
-            image = read_image(drive.image_files[i])
-            if image is not None:
-                image = frontend.undistort(image)
-                both.append(rectify(image, drive.camera_file.camera, mount, T, extent))
-        floors.append(both)
-    return floors, extent
-
-
-def _apart(at, distance: float) -> tuple[int, int]:
-    """The straightest stretch of about that length."""
-    import numpy as np
-
-    second = np.searchsorted(at.travelled, at.travelled + distance)
-    first = np.flatnonzero(second < len(at.travelled))
-    if not len(first):
-        return 0, len(at.travelled) - 1
-    bend = [np.ptp(at.yaw[i : second[i] + 1]) for i in first]
-    i = int(first[int(np.argmin(bend))])
-    return i, int(second[i])

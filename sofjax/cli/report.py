@@ -151,8 +151,13 @@ def write_report(
     tally: Tally,
     results: Results,
     seconds: dict[str, float],
+    mount: dict[str, object] | None = None,
 ) -> None:
-    """`report.json`: all that there is to know about a run, for machines and for later."""
+    """`report.json`: all that there is to know about a run, for machines and for later.
+
+    **Arguments:**
+    - `mount`: what `--calibrate` found, if it was asked for.
+    """
     outputs.write_json(
         folder / outputs.REPORT,
         {
@@ -160,6 +165,7 @@ def write_report(
             "interrupted": results.interrupted,
             "seed": settings.seed,
             "settings": to_dict(settings),
+            "calibration": mount,
             "versions": {"python": platform.python_version()}
             | {package: version(package) for package in PACKAGES},
             "device": f"{jax.default_backend()}, {platform.machine()}",

@@ -1,6 +1,7 @@
 """`sofjax run`: a drive in, a trajectory and a map out."""
 
 import argparse
+import dataclasses
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,13 +24,18 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="estimate the trajectory and the map of a drive",
         description="Estimate the trajectory and the map of floor segments of a drive.",
         usage="sofjax run DRIVE [--out DIR] [--particles N] [--seed S] [--detector hough|lsd] "
-        "[--config FILE] [--set name=value ...]",
+        "[--calibrate] [--config FILE] [--set name=value ...]",
     )
     parser.add_argument("drive", metavar="DRIVE", nargs="?", type=Path, help="folder of the drive")
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: runs/<drive>-<time>/")
     parser.add_argument("--particles", metavar="N", type=int, help="size of the filter")
     parser.add_argument("--seed", metavar="S", type=int, help="of the random numbers; default 0")
     parser.add_argument("--detector", choices=("hough", "lsd"), help="of the segments in an image")
+    parser.add_argument(
+        "--calibrate",
+        action="store_true",
+        help="first fit the camera's height, pitch and roll to the drive, and run with them",
+    )
     parser.add_argument("--config", metavar="FILE", type=Path, help="settings as TOML")
     parser.add_argument(
         "--set",
@@ -49,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     begun = time.perf_counter()
     from tqdm import tqdm
 
-    from sofjax.cli import outputs, report
+    from sofjax.cli import calibrate_mount, outputs, report
     from sofjax.cli.settings import gather
     from sofjax.cli.tally import Tally
     from sofjax.io.drive import read_drive
@@ -61,9 +67,15 @@ def run(args: argparse.Namespace) -> int:
     settings = gather(args)
     drive = read_drive(args.drive)
     check_images(drive)
-    frontend = Frontend(drive.camera_file, settings.frontend)
     folder = outputs.make_folder(args.out, drive.name)
     write_atomically(folder / outputs.CONFIG, to_toml(to_dict(settings)))
+    fitted = None
+    if args.calibrate:
+        fitted = calibrate_mount.fit_before_run(drive, settings.frontend, folder)
+        if not fitted.usable:
+            return calibrate_mount.REFUSED
+        drive = dataclasses.replace(drive, camera_file=fitted.camera_file)
+    frontend = Frontend(drive.camera_file, settings.frontend)
 
     tally, state, interrupted = Tally(), None, False
     started = time.perf_counter()
@@ -83,7 +95,8 @@ def run(args: argparse.Namespace) -> int:
     results = report.write_results(folder, drive, settings, tally, state, interrupted)
     ended = time.perf_counter()
     seconds = {"start": started - begun, "drive": driven - started, "write": ended - driven}
-    report.write_report(folder, drive, settings, tally, results, seconds)
+    mount = fitted and fitted.numbers
+    report.write_report(folder, drive, settings, tally, results, seconds, mount)
     print(report.summary(folder, drive, tally, results, seconds))
     return 130 if interrupted else 0
 

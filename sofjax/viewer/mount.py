@@ -42,6 +42,7 @@ def draw_mount(
     for axes, both, name in zip(views, floors, ("old", "new"), strict=True):
         if len(both) == 2:  # red and cyan: grey where the two agree
             picture = np.stack([both[0], both[1], both[1]], axis=-1)
+            picture[(picture == 0).any(axis=-1)] = 0  # where one of them does not reach
             axes.imshow(picture, extent=(y1, y0, x0, x1), aspect="equal")
         axes.set_title(f"the floor from two images by the {name} mount", loc="left", fontsize=9)
         axes.set_xlabel("y, metres")
