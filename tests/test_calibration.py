@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from conftest import make_camera
+from conftest import jit_quickly, make_camera
 
-from sofjax.calibration import UNKNOWNS, FitRules, PairNoise, Pairs, distances, expected, fit_mount
+from sofjax.calibration import UNKNOWNS, FitRules, PairNoise, Pairs, distances, expected
+from sofjax.calibration import fit_mount as compiled_well
 from sofjax.calibration.fit import verdict
 from sofjax.calibration.heights import FloorRules, on_floor
 from sofjax.calibration.pairs import start_at
@@ -20,6 +21,13 @@ pytestmark = pytest.mark.usefixtures("x64")
 
 N = 96
 MOUNT = (0.05, 0.0, 0.6, 0.26, 0.02, 0.0)  # x, y, height, pitch, roll, yaw
+
+
+@jit_quickly
+def fit_mount(camera, mount, pairs, rules=None):
+    return compiled_well(camera, mount, pairs, rules or FitRules())
+
+
 FIT = {"height": 0.6, "pitch": 0.26, "roll": 0.02}
 
 
@@ -130,7 +138,7 @@ def test_twenty_four_starts_at_once_end_in_one_place(camera, mount, rng):
     pairs = make_pairs(camera, mount, rng, noise=0.5)
     times, pitch = jnp.meshgrid(jnp.linspace(0.7, 1.3, 6), jnp.radians(jnp.linspace(-8, 8, 4)))
     begin = jax.vmap(lambda t, p: off(mount, t, p))(times.ravel(), pitch.ravel())
-    ends = jax.vmap(lambda m: fit_mount(camera, m, pairs).mount)(begin)
+    ends = jit_quickly(jax.vmap(lambda m: compiled_well(camera, m, pairs).mount))(begin)
     assert max(np.ptp(ends.height), np.ptp(ends.pitch), np.ptp(ends.roll)) < 1e-4
 
 
@@ -193,17 +201,19 @@ def implicit(camera, mount, pairs):
         T = pairs.T_first_second
         moved = eqx.tree_at(lambda p: p.T_first_second.xy, moved, T.xy * (1 + x[2]))
         other = eqx.tree_at(lambda c: c.K, camera, camera.K.at[0, 0].add(x[3]))
-        m = fit_mount(other, mount, moved).mount
+        m = compiled_well(other, mount, moved).mount
         return jnp.stack([m.height, m.pitch, m.roll])
 
     return fitted
 
 
+@pytest.mark.slow
 def test_the_derivative_of_the_fit_is_that_of_finite_differences(camera, mount, rng):
     pairs = make_pairs(camera, mount, rng, noise=0.5)
     fitted = implicit(camera, mount, pairs)
     steps = np.array([0.3, 0.3, 1e-2, 1.0])
-    J = jax.jacrev(fitted)(jnp.zeros(4))
+    J = jit_quickly(jax.jacrev(fitted))(jnp.zeros(4))
+    fitted = jit_quickly(fitted)
     assert np.isfinite(J).all()
     for i, h in enumerate(steps):
         e = np.eye(4)[i] * h
@@ -211,6 +221,7 @@ def test_the_derivative_of_the_fit_is_that_of_finite_differences(camera, mount, 
         np.testing.assert_allclose(J[:, i], (up - down) / (2 * h), rtol=0.02, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_truth_lies_within_the_error_bars_and_the_error_is_near_the_bound(camera, mount):
     """Two hundred logs: near the Cramér-Rao bound, and inside 2 sigma as often as it must."""
     rng = np.random.default_rng(3)
@@ -221,12 +232,12 @@ def test_truth_lies_within_the_error_bars_and_the_error_is_near_the_bound(camera
         pairs = eqx.tree_at(
             lambda p: (p.first, p.second), clean, (clean.first + a, clean.second + b)
         )
-        found = fit_mount(camera, mount, weighed(camera, mount, pairs))
+        found = compiled_well(camera, mount, weighed(camera, mount, pairs))
         return jnp.stack(
             [found.mount.height, found.mount.pitch, found.mount.roll]
         ), found.covariance
 
-    got, covariance = jax.vmap(one)(*draws)
+    got, covariance = jit_quickly(jax.vmap(one))(*draws)
     error = np.asarray(got) - list(FIT.values())
     inside = np.abs(error) < 2 * np.sqrt(np.asarray(covariance)[:, range(3), range(3)])
     assert (inside.mean(0) > 0.9).all() and (inside.mean(0) <= 0.99).all(), inside.mean(0)

@@ -1,0 +1,196 @@
+"""Which residual fits the mount best: rho and theta of eq. (9), or distances of the end points?
+
+    python run.py [--quick] [--json FILE]
+
+Logs of floor segments with 0.5 px noise from the simulator: random rigs in random worlds, exact
+odometry, no vibration. Tracks and pairs are the same for all residuals, and so is the solver.
+"""
+
+import argparse
+import dataclasses
+import json
+import platform
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from sofjax.calibration import PairNoise, expected, fit_mount
+from sofjax.calibration.fit import robust
+from sofjax.calibration.pairs import distances, start_at
+from sofjax.calibration.tracks import TrackRules, follow, relate
+from sofjax.geometry import (
+    line_through,
+    polar,
+    polar_difference,
+    transfer_line,
+    two_view_homography,
+)
+from sofjax.simulation import Detection, Odometer, Scene, make_world, observe, random_rig, take_ride
+
+NOISE, CAPACITY, IMAGES = 0.5, 1024, 160
+EXACT = Odometer(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+LSD = Detection(noise=NOISE, shortening=1.0, broken=0.0, false_segments=0.0, missed=0.05, apart=0.0)
+
+
+def make_log(seed: int):
+    """A drive's segments on the floor, its camera and true mount, in float64."""
+    world, rig = make_world("random", seed), random_rig(seed)
+    rig = dataclasses.replace(rig, odometer=EXACT, dropped=0.0, vibration=0.0)
+    ride = take_ride(world, rig, seed, IMAGES)
+    scene = Scene.of(world, edges=2048, walls=256)
+    scene = eqx.tree_at(
+        lambda s: (s.contrast, s.narrow),
+        scene,
+        (jnp.where(scene.on_floor, scene.contrast, 0), jnp.zeros_like(scene.narrow)),
+    )
+    camera = rig.camera_file.camera
+    log = jax.jit(observe, static_argnames="capacity")(
+        scene, camera, ride.mounts, ride.poses(), ride.motions(), jax.random.key(seed), LSD
+    )
+    double = lambda x: jnp.asarray(x, float if x.dtype.kind == "f" else x.dtype)
+    tree = jax.tree.map(lambda x: np.asarray(x), (camera, rig.camera_file.mount, log))
+    return jax.tree.map(double, tree)
+
+
+def polar_fit(camera, mount, pairs, sigma):
+    """The same fit with (rho, theta) of the second segment minus those of the carried line."""
+    centre = jnp.eye(3).at[:2, 2].set(-camera.K[:2, 2])
+
+    def one(by, first, second, T):
+        moved = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(3)])).mount
+        H = centre @ two_view_homography(camera, moved, T) @ jnp.linalg.inv(centre)
+        ends = lambda s: s - camera.K[:2, 2]
+        carried = transfer_line(H, line_through(*ends(first)))
+        return polar_difference(polar(line_through(*ends(second))), polar(carried)) / sigma
+
+    def residuals(by, _):
+        r = jax.vmap(one, (None, 0, 0, 0))(by, pairs.first, pairs.second, pairs.T_first_second)
+        return jax.vmap(robust, (0, None))(jnp.where(pairs.valid[:, None], r, 0), 2.0)
+
+    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    by = optx.least_squares(residuals, solver, jnp.zeros(3), max_steps=60, throw=False).value
+    J = jax.jacfwd(residuals)(by, None)
+    C = jnp.linalg.inv(jnp.einsum("nri,nrj->ij", J, J) + 1e-9 * jnp.eye(3))
+    m = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(3)])).mount
+    unit = jnp.stack([m.height, jnp.ones(()), jnp.ones(())])
+    return jnp.stack([m.height, m.pitch, m.roll]), C * jnp.outer(unit, unit)
+
+
+def endpoint_fit(camera, mount, pairs):
+    found = fit_mount(camera, mount, pairs)
+    m = found.mount
+    return jnp.stack([m.height, m.pitch, m.roll]), found.covariance[:3, :3]
+
+
+def bound(camera, mount, pairs):
+    """Cramér-Rao bound of (height, pitch, roll) from these pairs, every line unknown."""
+
+    def one(first, second, T):
+        of = lambda by, a, b: distances(
+            camera, start_at(mount).moved(jnp.concatenate([by, jnp.zeros(3)])), a, b, T
+        )[:2]
+        J, a, b = jax.jacfwd(of, (0, 1, 2))(jnp.zeros(3), first, second)
+        noise = jnp.concatenate([a.reshape(2, 4), b.reshape(2, 4)], axis=1)
+        return J.T @ jnp.linalg.solve(NOISE**2 * noise @ noise.T, J)
+
+    each = jax.vmap(one)(pairs.first, pairs.second, pairs.T_first_second)
+    information = jnp.sum(jnp.where(pairs.valid[:, None, None], each, 0), axis=0)
+    unit = jnp.stack([mount.height, jnp.ones(()), jnp.ones(())])
+    return jnp.sqrt(jnp.diag(jnp.linalg.inv(information))) * unit
+
+
+@eqx.filter_jit
+def fit_all(camera, mount, start, pairs, exact):
+    """All three fits of one log, and the bound."""
+    constant = jnp.array([5.0, 0.03])  # pixels and radians
+    tight = jnp.array([1.0, 0.015])
+    return {
+        "end points, weighed": endpoint_fit(camera, start, pairs),
+        "end points, one sigma": endpoint_fit(camera, start, exact),
+        "rho, theta (5 px, 1.7°)": polar_fit(camera, start, pairs, constant),
+        "rho, theta (1 px, 0.9°)": polar_fit(camera, start, pairs, tight),
+    }, bound(camera, mount, pairs)
+
+
+def study(seed: int):
+    """Errors, sigmas and the bound of one log; None where it has too few pairs for any fit."""
+    camera, mount, log = make_log(seed)
+    rough = eqx.tree_at(
+        lambda m: (m.height, m.pitch), mount, (mount.height * 1.1, mount.pitch + 0.03)
+    )
+    rules = TrackRules()
+    noise = PairNoise(pixel_sigma=NOISE, odometer=no_odometer())
+    track = follow(rules, camera, start_at(rough), log)
+    pairs, _ = relate(rules, log, track, float(rough.height), CAPACITY)
+    if pairs.valid.sum() < 60:
+        return None
+    # false tracks are the same for all residuals; here there are to be none
+    sigma = expected(noise, camera, start_at(mount), pairs)
+    off = jax.vmap(distances, (None, None, 0, 0, 0))(
+        camera, start_at(mount), pairs.first, pairs.second, pairs.T_first_second
+    )
+    true = pairs.valid & (jnp.abs(off / sigma).max(axis=1) < 5)
+    pairs = eqx.tree_at(lambda p: (p.sigma, p.valid), pairs, (sigma, true))
+    plain = eqx.tree_at(lambda p: p.sigma, pairs, jnp.full_like(sigma, NOISE * 2**0.5))
+    fits, least = fit_all(camera, mount, rough, pairs, plain)
+    true_value = np.array([mount.height, mount.pitch, mount.roll])
+    rows = {
+        name: (np.asarray(value) - true_value, np.sqrt(np.diag(np.asarray(C))))
+        for name, (value, C) in fits.items()
+    }
+    return rows, np.asarray(least), int(true.sum()), float(mount.height)
+
+
+def no_odometer():
+    from sofjax.motion import MotionModel
+
+    return MotionModel(*[0.0] * 8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="20 logs in the place of 200")
+    parser.add_argument("--json", metavar="FILE", type=Path)
+    args = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    begun, done, seed = time.time(), [], 0
+    logs = 20 if args.quick else 200
+    while len(done) < logs and seed < 3 * logs:
+        found = study(seed)
+        done += [found] if found else []
+        seed += 1
+    table = {}
+    least = np.array([d[1] for d in done])
+    for name in done[0][0]:
+        error = np.array([d[0][name][0] for d in done])
+        sigma = np.array([d[0][name][1] for d in done])
+        table[name] = {
+            "height_mm": 1e3 * float(np.sqrt(np.mean(error[:, 0] ** 2))),
+            "pitch_mrad": 1e3 * float(np.sqrt(np.mean(error[:, 1] ** 2))),
+            "roll_mrad": 1e3 * float(np.sqrt(np.mean(error[:, 2] ** 2))),
+            "times_bound": np.sqrt(np.mean((error / least) ** 2, axis=0)).tolist(),
+            "inside_2_sigma": np.mean(np.abs(error) < 2 * sigma, axis=0).tolist(),
+        }
+    print(f"{len(done)} logs of {seed}, pairs {min(d[2] for d in done)} to "
+          f"{max(d[2] for d in done)}; {time.time() - begun:.0f} s")  # fmt: skip
+    print("| residual | height | pitch | roll | times the bound | inside 2 sigma |\n|" + "---|" * 6)
+    for name, row in table.items():
+        times = ", ".join(f"{v:.2f}" for v in row["times_bound"])
+        inside = ", ".join(f"{100 * v:.0f} %" for v in row["inside_2_sigma"])
+        print(f"| {name} | {row['height_mm']:.1f} mm | {row['pitch_mrad']:.2f} mrad | "
+              f"{row['roll_mrad']:.2f} mrad | {times} | {inside} |")  # fmt: skip
+    if args.json:
+        args.json.write_text(
+            json.dumps({"logs": len(done), "machine": platform.machine(), "fits": table}, indent=1)
+        )
+
+
+if __name__ == "__main__":
+    main()
