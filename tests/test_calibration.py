@@ -237,7 +237,7 @@ def test_truth_lies_within_the_error_bars_and_the_error_is_near_the_bound(camera
             [found.mount.height, found.mount.pitch, found.mount.roll]
         ), found.covariance
 
-    got, covariance = jit_quickly(jax.vmap(one))(*draws)
+    got, covariance = jax.jit(jax.vmap(one))(*draws)
     error = np.asarray(got) - list(FIT.values())
     inside = np.abs(error) < 2 * np.sqrt(np.asarray(covariance)[:, range(3), range(3)])
     assert (inside.mean(0) > 0.9).all() and (inside.mean(0) <= 0.99).all(), inside.mean(0)

@@ -58,12 +58,13 @@ class DriveFit:
         usable, why = verdict(self.fit, rules.fit, self.pairs)
         starts = len(self.ends)
         if usable and 2 * self.agreeing <= starts:
-            low, high = self.ends.min(0), self.ends.max(0)
-            angle = np.degrees([low[1], high[1]])
+            (h0, *low), (h1, *high) = self.ends.min(0), self.ends.max(0)
+            places = [f"heights {h0:.3f} to {h1:.3f} m"] if h1 > h0 else []
+            for name, a, b in zip(("pitch", "roll"), *np.degrees([low, high]), strict=True):
+                places += [f"{name} {a:.1f} to {b:.1f}°"] if b > a else []
             usable = False
-            why = (
-                f"ambiguous: from {starts} starts the fit ends in different places, heights "
-                f"{low[0]:.3f} to {high[0]:.3f} m and pitches {angle[0]:.1f} to {angle[1]:.1f}°"
+            why = f"ambiguous: from {starts} starts the fit ends in different places, " + ", ".join(
+                places
             )
         return usable, why
 
