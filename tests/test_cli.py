@@ -1,6 +1,7 @@
 """The commands, end to end on the first images of the sample."""
 
 import json
+import os
 import resource
 import shutil
 import signal
@@ -324,3 +325,27 @@ def test_importing_the_library_is_light():
         "assert not heavy, heavy"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# Compilations that are kept
+
+
+def test_with_a_cache_the_second_start_compiles_nothing(drive, tmp_path):
+    """Each start a process of its own: what the second had compiled would lie there too."""
+    cache, kept = tmp_path / "cache", []
+    for name in ("first", "second"):
+        command = [sys.executable, "-m", "sofjax", "run", drive, "--out", tmp_path / name, *SMALL]
+        environment = {**os.environ, "SOFJAX_CACHE": str(cache)}
+        subprocess.run(command, env=environment, capture_output=True, check=True)
+        kept.append({file.name for file in cache.glob("*-cache")})
+    assert kept[0] and kept[1] == kept[0]
+    for file in ("trajectory.txt", "map.geojson"):
+        first, second = ((tmp_path / name / file).read_text() for name in ("first", "second"))
+        assert first == second
+
+
+def test_a_cache_that_cannot_be_written_is_refused(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("SOFJAX_CACHE", str(tmp_path / "file"))
+    assert main(["run", "drive"]) == 2
+    assert "SOFJAX_CACHE" in capsys.readouterr().err

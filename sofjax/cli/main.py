@@ -18,6 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         args = _parser().parse_args(argv)
+        _keep_compilations()
         return args.run(args)
     except SystemExit as end:  # argparse has printed its own
         return end.code if isinstance(end.code, int) else 0
@@ -33,6 +34,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"sofjax: {error.filename or 'the system'}: {error.strerror}", file=sys.stderr)
         return 1
+
+
+def _keep_compilations() -> None:
+    """With SOFJAX_CACHE=DIR, what is compiled is kept there, and the next start reads it."""
+    folder = os.environ.get("SOFJAX_CACHE")
+    if not folder:
+        return
+    try:
+        os.makedirs(folder, exist_ok=True)
+        writable = os.access(folder, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        raise InputError(f"SOFJAX_CACHE: '{folder}' must be a folder that can be written to")
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", os.path.abspath(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many are small
 
 
 def _parser() -> argparse.ArgumentParser:
