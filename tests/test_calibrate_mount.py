@@ -102,6 +102,16 @@ def test_a_drive_that_tells_nothing_is_no_answer(tmp_path, capfd):
     assert "is not run" in capfd.readouterr().out
 
 
+@pytest.mark.slow
+def test_poses_lines_and_mount_together(tmp_path, capfd):
+    drive, out = make_drive(tmp_path / "drive", 100), tmp_path / "camera.yaml"
+    assert calibrate(drive, "--joint", "-o", out) == 0
+    mount = read_camera(out).mount
+    assert float(mount.height) == pytest.approx(0.594, rel=0.03)
+    assert float(mount.pitch) == pytest.approx(TILT, abs=math.radians(0.3))
+    assert "jointly" in capfd.readouterr().out
+
+
 def test_names_to_free():
     assert free_names(" pitch , height,pitch") == ("pitch", "height")
 

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -189,6 +190,7 @@ def calibrate(
     pairs = len(residuals)
     verdict = _words(fitted, covariance) if usable else why
     count = f"{pairs} of {found.related} pairs of segments taken for floor"
+    count += ", then jointly with poses and lines" * (usable and joint)
     print_lines = [
         f"{drive.name}: {len(drive.image_files)} images, {at.travelled[-1]:.1f} m, {count}",
         *(f"  {line}" for line in lines),
@@ -223,8 +225,8 @@ def observed(drive: "Drive", frontend: "Frontend") -> "Observation":
 
     from sofjax.vision import observe_drive
 
-    bar = tqdm(drive.image_files, desc="segments", unit=" images", disable=None)
-    return observe_drive(dataclasses.replace(drive, image_files=bar), frontend)
+    bar = functools.partial(tqdm, desc="segments", unit=" images", disable=None)
+    return observe_drive(drive, frontend, bar)
 
 
 def _jointly(camera, found: "DriveFit", log: "Observation", free: tuple[str, ...]):

@@ -1,5 +1,7 @@
 """From images and odometry to what the filter takes."""
 
+from collections.abc import Callable, Iterable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,13 +26,15 @@ def observation(view: View, motion: np.ndarray) -> Observation:
     )
 
 
-def observe_drive(drive: Drive, frontend: Frontend) -> Observation:
+def observe_drive(
+    drive: Drive, frontend: Frontend, progress: Callable[[Iterable], Iterable] = iter
+) -> Observation:
     """A whole drive with a leading axis T: detected once, replayed as often as one likes.
 
-    An image that cannot be read is one without segments.
+    An image that cannot be read is one without segments. `progress` wraps the loop over the images.
     """
     each = [
         observation(frontend.view(file), motion)
-        for file, motion in zip(drive.image_files, motions(drive), strict=True)
+        for file, motion in zip(progress(drive.image_files), motions(drive), strict=True)
     ]
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each)
