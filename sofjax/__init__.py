@@ -41,6 +41,7 @@ _MODULES += (
     "presets",
     "batch",
     "smoothing",
+    "loop_closure",
     "observation",
     "evaluation",
     "io",

@@ -23,7 +23,7 @@ from sofjax.io.trajectory import read_trajectory
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 IMAGES = 40
-SMALL = ["--particles", "50"]
+SMALL = ["--particles", "50", "--loop", "none"]  # the smoothing takes its time to compile
 FILES = {"trajectory.txt", "map.geojson", "map.png", "report.json", "config.toml"}
 
 
@@ -55,12 +55,32 @@ def drive(tmp_path_factory):
 def done(drive, tmp_path_factory):
     """A run of the drive that the tests look at."""
     folder = tmp_path_factory.mktemp("runs") / "done"
-    assert run(drive, "--out", folder) == 0
+    assert main(["run", str(drive), "--out", str(folder), *SMALL[:2]]) == 0
     return folder
 
 
-def test_a_run_writes_its_five_files_and_no_more(done):
-    assert {path.name for path in done.iterdir()} == FILES
+def test_a_run_writes_its_six_files_and_no_more(done):
+    assert {path.name for path in done.iterdir()} == FILES | {"trajectory_smoothed.txt"}
+
+
+def test_the_smoothed_trajectory_is_another_and_no_worse(done):
+    online, smoothed = (
+        read_trajectory(done / name) for name in ("trajectory.txt", "trajectory_smoothed.txt")
+    )
+    np.testing.assert_allclose(smoothed.stamps, online.stamps)
+    assert 0 < np.abs(smoothed.xy - online.xy).max() < 0.2
+    report = report_of(done)
+    assert report["errors"]["smoothed"]["ate_m"] < report["errors"]["trajectory"]["ate_m"] + 0.005
+    loop = report["loop"]
+    assert loop["asked"] == "smooth" and loop["keyframes"] > 10 and loop["lines"] > 5
+    assert all(cost["after"] <= cost["before"] for cost in loop["cost"])
+
+
+def test_without_closing_only_the_online_estimate_is_written(drive, tmp_path):
+    assert run(drive, "--out", tmp_path) == 0
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+    report = report_of(tmp_path)
+    assert report["loop"] == {"asked": "none"} and report["errors"]["smoothed"] is None
 
 
 def test_the_trajectory_has_a_row_for_every_image(done, drive):
@@ -103,7 +123,7 @@ def test_the_report_counts_the_funnel_and_the_errors(done):
 def test_the_config_of_a_run_gives_the_same_files_again(done, drive, tmp_path):
     args = ["run", str(drive), "--out", str(tmp_path), "--config", str(done / "config.toml")]
     assert main(args) == 0
-    for name in ("trajectory.txt", "map.geojson", "config.toml", "map.png"):
+    for name in sorted(FILES - {"report.json"} | {"trajectory_smoothed.txt"}):
         assert (tmp_path / name).read_bytes() == (done / name).read_bytes(), name
 
 
@@ -122,7 +142,9 @@ def test_settings_come_from_the_preset_the_file_and_the_options_in_this_order(dr
 
         return gather(_parser().parse_args(["run", str(drive), *map(str, args)]))
 
-    assert gathered().frontend.detector == "lsd"
+    assert gathered().frontend.detector == "lsd" and gathered().loop == "smooth"
+    assert gathered("--set", "preset=paper").loop == "none"
+    assert gathered("--set", "preset=paper", "--loop", "smooth").loop == "smooth"
     assert gathered("--set", "preset=paper").frontend.detector == "hough"
     file = tmp_path / "c.toml"
     file.write_text('preset = "paper"\nseed = 4\n[frontend]\ncapacity = 9\n')
@@ -172,7 +194,7 @@ def test_a_drive_without_truth_has_no_errors(tmp_path, capfd):
     (drive / "floor_segments.csv").unlink()
     assert run(drive, "--out", tmp_path / "out") == 0
     assert report_of(tmp_path / "out")["errors"] == {
-        "trajectory": None, "odometry": None, "map": None
+        "trajectory": None, "smoothed": None, "odometry": None, "map": None
     }  # fmt: skip
     assert "against the truth" not in capfd.readouterr().out
     assert (tmp_path / "out" / "map.png").exists()

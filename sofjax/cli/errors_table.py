@@ -13,22 +13,25 @@ ROWS = (
 
 
 def errors_table(
-    trajectory: TrajectoryErrors, odometry: TrajectoryErrors | None, of_map: MapErrors | None
+    trajectory: TrajectoryErrors,
+    smoothed: TrajectoryErrors | None,
+    odometry: TrajectoryErrors | None,
+    of_map: MapErrors | None,
 ) -> list[str]:
-    """Lines that set the estimate beside the odometry, and the map below."""
-    head = f"  against the truth, aligned without scale {'sofjax':>9}"
-    lines = [head + (f" {'odometry':>10}" if odometry else "")]
+    """Lines that set the estimates beside the odometry, and the map below."""
+    columns = [("sofjax", trajectory), ("smoothed", smoothed), ("odometry", odometry)]
+    columns = [(name, errors) for name, errors in columns if errors]
+    heads = "".join(f"{name:>10}" for name, _ in columns)
+    lines = [f"  against the truth, aligned without scale{heads}"]
     for name, label, form in ROWS:
-        line = f"    {label:38} {form.format(getattr(trajectory, name)):>9}"
-        if odometry:
-            line += f" {form.format(getattr(odometry, name)):>10}"
-        lines.append(line)
+        values = "".join(f"{form.format(getattr(errors, name)):>10}" for _, errors in columns)
+        lines.append(f"    {label:38}{values}")
     if trajectory.coverage < 0.99:
-        lines.append(f"    {'share of the true path':38} {trajectory.coverage:>9.2f}")
+        lines.append(f"    {'share of the true path':38}{trajectory.coverage:>10.2f}")
     if of_map:
         lines += [
-            f"    {'map, precision':38} {of_map.precision:>9.2f}",
-            f"    {'map, recall':38} {of_map.recall:>9.2f}",
-            f"    {'map, error':38} {1e3 * of_map.error_m:>6.1f} mm",
+            f"    {'map, precision':38}{of_map.precision:>10.2f}",
+            f"    {'map, recall':38}{of_map.recall:>10.2f}",
+            f"    {'map, error':38}{1e3 * of_map.error_m:>7.1f} mm",
         ]
     return lines

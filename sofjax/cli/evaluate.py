@@ -38,6 +38,11 @@ def run(args: argparse.Namespace) -> int:
         )
     estimate = read_trajectory(args.folder / outputs.TRAJECTORY, "the trajectory of the run")
     errors, motion = evaluate_trajectory(truth, estimate)
+    smoothed = None
+    if (args.folder / outputs.SMOOTHED).exists():  # the map is of its frame
+        path = args.folder / outputs.SMOOTHED
+        estimate = read_trajectory(path, "the smoothed trajectory of the run")
+        smoothed, motion = evaluate_trajectory(truth, estimate)
     odometry = None
     if (drive / "odometry.txt").exists():
         read = read_trajectory(drive / "odometry.txt", "the odometry").at(estimate.stamps)
@@ -47,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         segments, _ = read_map(args.folder / outputs.MAP)
         of_map = evaluate_map(true_segments, segments, motion, shared(truth, estimate).xy)
     print(f"{args.folder} of {drive.resolve().name}: {errors.path_m:.1f} m")
-    print("\n".join(errors_table(errors, odometry, of_map)))
+    print("\n".join(errors_table(errors, smoothed, odometry, of_map)))
     if of_map is None:
         print("    the map is not compared: its file or floor_segments.csv is missing")
     return 0

@@ -8,7 +8,8 @@ from pathlib import Path
 from sofjax.io.errors import InputError
 from sofjax.io.text import write_atomically
 
-TRAJECTORY, MAP, FIGURE = "trajectory.txt", "map.geojson", "map.png"
+TRAJECTORY, SMOOTHED = "trajectory.txt", "trajectory_smoothed.txt"
+MAP, FIGURE = "map.geojson", "map.png"
 REPORT, CONFIG = "report.json", "config.toml"
 CAMERA, MOUNT = "camera.yaml", "mount.png"  # of `run --calibrate`
 
@@ -17,7 +18,7 @@ def make_folder(out: Path | None, name: str) -> Path:
     """The folder for the results, there and writable; what an earlier run left in it is removed."""
     folder = out or _unused(Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     check_writable(folder)
-    for file in (TRAJECTORY, MAP, FIGURE, REPORT, CONFIG, CAMERA, MOUNT):
+    for file in (TRAJECTORY, SMOOTHED, MAP, FIGURE, REPORT, CONFIG, CAMERA, MOUNT):
         (folder / file).unlink(missing_ok=True)
     return folder
 

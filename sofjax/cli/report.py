@@ -15,7 +15,7 @@ from sofjax import slam, viewer
 from sofjax.cli import outputs
 from sofjax.cli.errors_table import errors_table
 from sofjax.cli.settings import RunSettings
-from sofjax.cli.tally import Tally
+from sofjax.cli.tally import Closed, Tally
 from sofjax.evaluation import (
     MapErrors,
     RigidMotion,
@@ -41,7 +41,9 @@ class Results:
     left_out: int  # lines that the filter kept and that are not known to lie on the floor
     interrupted: bool
     warnings: list[str]
+    closed: Closed | None = None
     trajectory: TrajectoryErrors | None = None
+    smoothed: TrajectoryErrors | None = None  # of the path found after the drive
     odometry: TrajectoryErrors | None = None  # of the odometry alone, at the same images
     map: MapErrors | None = None
 
@@ -52,20 +54,26 @@ def write_results(
     settings: RunSettings,
     tally: Tally,
     state: slam.SlamState | None,
+    closed: Closed | None,
     interrupted: bool,
 ) -> Results:
     """Write the map and the figure, and compare with the truth where it is known."""
-    results = Results(np.zeros((0, 2, 2)), 0, interrupted, warnings(drive, tally))
+    results = Results(np.zeros((0, 2, 2)), 0, interrupted, warnings(drive, tally), closed)
     seen, height = np.zeros(0, int), np.zeros(0)
     if state is not None:
-        final_map = eqx.filter_jit(slam.final_map)  # one compilation for all its small operations
-        mount = drive.camera_file.mount
-        final = jax.device_get(final_map(settings.slam, mount, state.segment_map))
+        if closed is None:
+            # one compilation for all its small operations
+            final_map = eqx.filter_jit(slam.final_map)
+            mount = drive.camera_file.mount
+            final = jax.device_get(final_map(settings.slam, mount, state.segment_map))
+            lines = np.asarray(state.segment_map.valid).sum()
+        else:
+            final, lines = closed.final, closed.report["lines"]
         keep = final.is_floor
         results.segments, seen, height = (
             v[keep] for v in (final.endpoints_world.astype(float), final.updates, final.height)
         )
-        results.left_out = int((np.asarray(state.segment_map.valid) & ~keep).sum())
+        results.left_out = int(lines - keep.sum())
     write_map(folder / outputs.MAP, results.segments, seen, height)
     motion = _compare(drive, tally, results) if tally.stamps else None
     if not viewer.available():
@@ -87,6 +95,9 @@ def _compare(drive: Drive, tally: Tally, results: Results) -> RigidMotion | None
     except InputError as error:
         results.warnings.append(f"no errors against the truth: {error}")
         return None
+    if results.closed:  # the map is of its frame
+        estimate = results.closed.trajectory
+        results.smoothed, motion = evaluate_trajectory(drive.groundtruth, estimate)
     if drive.floor_segments is not None:
         path = shared(drive.groundtruth, estimate).xy
         results.map = evaluate_map(drive.floor_segments, results.segments, motion, path)
@@ -97,7 +108,8 @@ def _draw(
     path: Path, drive: Drive, tally: Tally, results: Results, motion: RigidMotion | None
 ) -> None:
     """The figure in the frame of the truth if it is known, and in the map's otherwise."""
-    estimate = tally.trajectory
+    closed = results.closed
+    estimate = closed.trajectory if closed else tally.trajectory
     odometry = drive.odometry.at(estimate.stamps)
     turn = estimate.yaw[0] - odometry.yaw[0]
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -105,7 +117,7 @@ def _draw(
     to_truth = motion or RigidMotion(np.eye(2), np.zeros(2))
     title = f"{drive.name}: {len(estimate.stamps)} images, {estimate.travelled[-1]:.1f} m"
     if results.trajectory:
-        e = results.trajectory
+        e = results.smoothed or results.trajectory
         title += f", {e.ate_m:.3f} m and {e.yaw_deg:.2f}° from the true path"
     viewer.draw_map(
         path,
@@ -115,7 +127,16 @@ def _draw(
         segments=to_truth.apply(results.segments),
         true_robot=drive.groundtruth.xy if motion else None,
         true_segments=drive.floor_segments if motion else None,
+        online=to_truth.apply(tally.trajectory.xy) if closed else None,
+        ellipses=_ellipses(closed, to_truth) if closed else None,
     )
+
+
+def _ellipses(closed: Closed, to_truth: RigidMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Middles and covariances at some thirty places of the path."""
+    few = slice(0, None, max(1, len(closed.places) // 30))
+    covariances = to_truth.R @ closed.covariances[few] @ to_truth.R.T
+    return to_truth.apply(closed.places[few]), covariances
 
 
 def warnings(drive: Drive, tally: Tally) -> list[str]:
@@ -187,6 +208,7 @@ def write_report(
                 "lost": tally.step["lost"],
                 "unreadable": tally.unreadable,
             },
+            "loop": {"asked": settings.loop} | (results.closed.report if results.closed else {}),
             "frames_per_second": tally.frames_per_second,
             "milliseconds_per_image": tally.milliseconds(),
             "seconds": seconds | {"first_image": sum(tally.seconds[0].values())}
@@ -197,6 +219,7 @@ def write_report(
                 name: asdict(errors) if errors else None
                 for name, errors in (
                     ("trajectory", results.trajectory),
+                    ("smoothed", results.smoothed),
                     ("odometry", results.odometry),
                     ("map", results.map),
                 )
@@ -227,14 +250,29 @@ def summary(
         f"horizon, {step['associated']} associated, {step['matched']} matched to the map",
         f"  map       {len(results.segments)} segments on the floor; {results.left_out} lines left "
         "out, above it or seen too little",
+        *_closing(results.closed),
         f"  time      {sum(seconds.values()):.1f} s"
         + (f"; {fps:.0f} frames a second ({stages} ms)" if fps else ""),
     ]
     if results.trajectory:
-        lines += errors_table(results.trajectory, results.odometry, results.map)
+        lines += errors_table(results.trajectory, results.smoothed, results.odometry, results.map)
     lines += [f"  warning   {warning}" for warning in results.warnings]
     if tally.unreadable:
         few = ", ".join(tally.unreadable[:3])
         lines.append(f"            not read: {few}{' ...' * (len(tally.unreadable) > 3)}")
     lines.append(f"written to {folder}/")
     return "\n".join(lines)
+
+
+def _closing(closed: Closed | None) -> list[str]:
+    """What the closing did, in a line."""
+    if closed is None:
+        return []
+    r = closed.report
+    loops = f"{r['accepted']} loops closed, {r['refused']} refused"
+    if "keyframes" not in r:
+        return [f"  closed    {loops}"]
+    return [
+        f"  smoothed  {r['keyframes']} keyframes and {r['lines']} lines in {r['seconds']:.1f} s, "
+        f"{r['merged']} described twice; {loops}" + "; it did not settle" * (not r["converged"])
+    ]

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sofjax.cli.settings import RunSettings
     from sofjax.io.drive import Drive
+    from sofjax.observation import Observation
     from sofjax.slam import SlamState, StepInfo
     from sofjax.vision import Frontend, View
 
+LOOPS = ("none", "paper", "smooth")
 AHEAD = 8  # images that are searched for segments before the filter asks for them
 
 
@@ -24,7 +26,7 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         help="estimate the trajectory and the map of a drive",
         description="Estimate the trajectory and the map of floor segments of a drive.",
         usage="sofjax run DRIVE [--out DIR] [--particles N] [--seed S] [--detector hough|lsd] "
-        "[--calibrate] [--config FILE] [--set name=value ...]",
+        "[--calibrate] [--loop none|paper|smooth] [--config FILE] [--set name=value ...]",
     )
     parser.add_argument("drive", metavar="DRIVE", nargs="?", type=Path, help="folder of the drive")
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: runs/<drive>-<time>/")
@@ -35,6 +37,11 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
         "--calibrate",
         action="store_true",
         help="first fit the camera's height, pitch and roll to the drive, and run with them",
+    )
+    parser.add_argument(
+        "--loop",
+        choices=LOOPS,
+        help="after the drive: nothing, the paper's closing, or all poses and lines solved at once",
     )
     parser.add_argument("--config", metavar="FILE", type=Path, help="settings as TOML")
     parser.add_argument(
@@ -82,8 +89,8 @@ def run(args: argparse.Namespace) -> int:
     bar = tqdm(total=len(drive.image_files), desc=drive.name, unit="frame", disable=None)
     with bar, TrajectoryWriter(folder / outputs.TRAJECTORY) as writer:
         try:
-            for view, info, seconds, state in steps(settings, drive, frontend):  # noqa: B007
-                tally.add(drive, view, info, seconds, time.perf_counter())
+            for view, observed, info, seconds, state in steps(settings, drive, frontend):  # noqa: B007
+                tally.add(drive, view, observed, info, seconds, time.perf_counter())
                 writer.write(tally.stamps[-1], tally.poses[-1][:2], tally.poses[-1][2])
                 bar.update()
                 if len(tally.stamps) == 1:
@@ -92,9 +99,20 @@ def run(args: argparse.Namespace) -> int:
             interrupted = True
     driven = time.perf_counter()
 
-    results = report.write_results(folder, drive, settings, tally, state, interrupted)
+    closed = None
+    if settings.loop != "none" and state is not None and not interrupted:
+        from sofjax.cli.closing import close  # with optimistix, which takes its time to import
+
+        closed = close(folder, drive, settings, tally, state)
+    smoothed = time.perf_counter()
+    results = report.write_results(folder, drive, settings, tally, state, closed, interrupted)
     ended = time.perf_counter()
-    seconds = {"start": started - begun, "drive": driven - started, "write": ended - driven}
+    seconds = {
+        "start": started - begun,
+        "drive": driven - started,
+        "loop": smoothed - driven,
+        "write": ended - smoothed,
+    }
     mount = fitted and fitted.numbers
     report.write_report(folder, drive, settings, tally, results, seconds, mount)
     print(report.summary(folder, drive, tally, results, seconds))
@@ -103,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
 
 def steps(
     settings: "RunSettings", drive: "Drive", frontend: "Frontend"
-) -> Iterator[tuple["View", "StepInfo", dict[str, float], "SlamState"]]:
+) -> Iterator[tuple["View", "Observation", "StepInfo", dict[str, float], "SlamState"]]:
     """Fig. 6 for one image after the other, with the seconds that each waited and computed."""
     import jax
 
@@ -123,7 +141,7 @@ def steps(
             state, info = slam.step(config, camera, mount, state, observed)
             info = jax.device_get(info)
             stepped = time.perf_counter()
-            yield view, info, {"wait": waited - begun, "step": stepped - waited}, state
+            yield view, observed, info, {"wait": waited - begun, "step": stepped - waited}, state
 
 
 def views(frontend: "Frontend", files: list[Path]) -> Iterator["View"]:

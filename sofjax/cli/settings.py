@@ -11,7 +11,10 @@ from sofjax.vision import DETECTORS, FrontendSettings
 
 FRONTENDS = {"paper": FrontendSettings(detector="hough")}  # of a preset; the default otherwise
 
+CLOSINGS = {"paper": "none"}  # likewise; the paper closes by hand, where it knows of a loop
+
 CHOICES = {
+    "loop": ("none", "paper", "smooth"),
     "frontend.detector": tuple(DETECTORS),
     "filter.choice": ("resample", "winner"),
     "segment_map.rule": ("kalman", "gamma"),
@@ -33,6 +36,7 @@ class RunSettings:
     seed: int
     frontend: FrontendSettings
     slam: SlamConfig = dataclasses.field(metadata=INLINE)
+    loop: str = "smooth"  # after the drive: "none", the "paper"'s closing, or "smooth"
 
 
 def gather(args: argparse.Namespace) -> RunSettings:
@@ -47,6 +51,7 @@ def gather(args: argparse.Namespace) -> RunSettings:
     named = {
         "--particles": ("filter.particles", getattr(args, "particles", None)),
         "--seed": ("seed", getattr(args, "seed", None)),
+        "--loop": ("loop", getattr(args, "loop", None)),
         "--detector": ("frontend.detector", getattr(args, "detector", None)),
     }
     for option, (name, value) in named.items():
@@ -68,7 +73,8 @@ def _preset(name: object, where: str) -> RunSettings:
     if name not in presets.PRESETS:
         hint = nearest(str(name), presets.PRESETS)
         raise InputError(f"{where}: there is no preset {name!r:.60}; {hint}")
-    return RunSettings(0, FRONTENDS.get(name, FrontendSettings()), presets.PRESETS[name])
+    frontend = FRONTENDS.get(name, FrontendSettings())
+    return RunSettings(0, frontend, presets.PRESETS[name], CLOSINGS.get(name, "smooth"))
 
 
 def _pairs(sets: list[str]) -> dict[str, object]:

@@ -2,12 +2,16 @@
 
 from dataclasses import dataclass, field
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from sofjax.geometry import SE2
 from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory
-from sofjax.slam import StepInfo
+from sofjax.observation import Observation
+from sofjax.slam import FinalMap, StepInfo
 from sofjax.vision import View
 
 WARM = 10  # images that timing leaves out: the first one compiles
@@ -20,6 +24,9 @@ class Tally:
 
     stamps: list[float] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)  # (x, y, yaw), metres, radians
+    observations: list[Observation] = field(default_factory=list)  # on the host
+    tilt: list[np.ndarray] = field(default_factory=list)  # (pitch, roll), radians
+    bias: np.ndarray | None = None  # the odometer's errors at last
     unreadable: list[str] = field(default_factory=list)  # files
     blind: int = 0  # images that were read and had no segment
     detected: int = 0  # segments
@@ -29,7 +36,13 @@ class Tally:
     done: list[float] = field(default_factory=list)  # clock at the end of each image
 
     def add(
-        self, drive: Drive, view: View, info: StepInfo, seconds: dict[str, float], now: float
+        self,
+        drive: Drive,
+        view: View,
+        observed: Observation,
+        info: StepInfo,
+        seconds: dict[str, float],
+        now: float,
     ) -> None:
         """The next image: what the front end saw, what the step said, and how long each took."""
         i = len(self.stamps)
@@ -41,6 +54,9 @@ class Tally:
             )
         self.stamps.append(float(drive.image_stamps[i]))
         self.poses.append(pose)
+        self.observations.append(jax.device_get(observed))
+        self.tilt.append(info.tilt)
+        self.bias = info.bias
         if not view.readable:
             self.unreadable.append(str(drive.image_files[i].relative_to(drive.path)))
         self.blind += view.readable and view.detected == 0
@@ -57,6 +73,12 @@ class Tally:
         return Trajectory(np.array(self.stamps), poses[:, :2], np.unwrap(poses[:, 2]))
 
     @property
+    def T_world_robot(self) -> SE2:
+        """The estimates, with a leading axis for the images."""
+        poses = np.reshape(self.poses, (-1, 3)).astype(np.float32)
+        return SE2(jnp.asarray(poses[:, :2]), jnp.asarray(poses[:, 2]))
+
+    @property
     def frames_per_second(self) -> float | None:
         """After the first ten images; None in a drive that has no more."""
         n = len(self.done) - WARM
@@ -67,3 +89,14 @@ class Tally:
         seconds = self.seconds[WARM:] or self.seconds
         stages = seconds[0] if seconds else {}
         return {stage: 1e3 * float(np.mean([s[stage] for s in seconds])) for stage in stages}
+
+
+@dataclass
+class Closed:
+    """What was found after the drive."""
+
+    trajectory: Trajectory
+    final: FinalMap
+    places: np.ndarray  # [n, 2], where the path's uncertainty is known, metres
+    covariances: np.ndarray  # [n, 2, 2], square metres
+    report: dict[str, object]

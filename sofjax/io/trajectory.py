@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from sofjax.io.errors import InputError
-from sofjax.io.text import rows
+from sofjax.io.text import rows, write_atomically
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
+HEAD = f"# T_world_robot: {COLUMNS}\n"
 
 
 @dataclass(frozen=True)
@@ -92,19 +93,27 @@ def finite(where: str, word: str) -> float:
     return value
 
 
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """All rows at once, and the file whole or not at all."""
+    poses = zip(trajectory.stamps, trajectory.xy, trajectory.yaw, strict=True)
+    write_atomically(path, HEAD + "".join(_row(*pose) for pose in poses))
+
+
+def _row(stamp: float, xy: np.ndarray, yaw: float) -> str:
+    qz, qw = math.sin(yaw / 2), math.cos(yaw / 2)
+    return f"{stamp:.6f} {xy[0]:.6f} {xy[1]:.6f} 0 0 0 {qz:.9f} {qw:.9f}\n"
+
+
 class TrajectoryWriter:
     """Writes rows as they come, each one complete on the disk before the next."""
 
     def __init__(self, path: Path):
         self._file = open(path, "w", encoding="utf-8", buffering=1)
-        self._file.write(f"# T_world_robot: {COLUMNS}\n")
+        self._file.write(HEAD)
 
     def write(self, stamp: float, xy: np.ndarray, yaw: float) -> None:
         """One pose: seconds, metres, radians."""
-        half = yaw / 2
-        self._file.write(
-            f"{stamp:.6f} {xy[0]:.6f} {xy[1]:.6f} 0 0 0 {math.sin(half):.9f} {math.cos(half):.9f}\n"
-        )
+        self._file.write(_row(stamp, xy, yaw))
 
     def close(self) -> None:
         self._file.close()

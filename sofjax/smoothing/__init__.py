@@ -19,6 +19,7 @@ from sofjax.smoothing.problem import residuals as residuals
 from sofjax.smoothing.rounds import Path as Path
 from sofjax.smoothing.rounds import Smoothed as Smoothed
 from sofjax.smoothing.rounds import SmoothingRules as SmoothingRules
+from sofjax.smoothing.rounds import final_map as final_map
 from sofjax.smoothing.rounds import smooth as smooth
 from sofjax.smoothing.solution import Solution as Solution
 from sofjax.smoothing.solution import solve as solve

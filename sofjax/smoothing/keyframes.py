@@ -26,47 +26,58 @@ def choose(T_world_robot: SE2, distance: float, angle: float) -> np.ndarray:
 def gather(log: Observation, index: np.ndarray) -> Keyframes:
     """The images of a log [T] at `index`, and what the odometer read from each to the next.
 
-    **Returns:** keyframes padded by `padded`: what is added sees nothing and does not move. No
+    **Returns:** keyframes padded by `filled`: what is added sees nothing and does not move. No
     segment is known yet.
     """
-    start, left, right, distance = _dead_reckoned(log.motion)
-    n = padded(len(index))
-    filled = np.concatenate([index, np.full(n - len(index), index[-1])])
-    before = np.concatenate([filled[:1], filled[:-1]])
-    at = lambda i: jax.tree.map(lambda a: a[i], start)
-    way = jnp.stack([total[filled] - total[before] for total in (distance, left, right)], axis=1)
-    segments = jax.tree.map(lambda a: jnp.asarray(a)[filled], log.segments_image)
-    real = jnp.arange(n) < len(index)
-    segments = Segments(segments.endpoints.astype(way.dtype), segments.valid & real[:, None])
-    none = jnp.zeros(segments.valid.shape, int)
-    return Keyframes(segments, none, none > 0, at(before).between(at(filled)), way)
+    return _gather(log, filled(index), len(index))
 
 
 def padded(size: int) -> int:
     return -(-size // PAD) * PAD
 
 
+def filled(index: np.ndarray) -> np.ndarray:
+    """The indices, the last one repeated up to the padded size."""
+    return np.append(index, np.full(padded(len(index)) - len(index), index[-1]))
+
+
 @jax.jit
-def _dead_reckoned(motion: SE2):
-    """Poses by the odometer alone, and the totals of left turns, right turns and distance."""
+def _gather(log, index, count):
+    motion = log.motion
     identity = SE2(jnp.zeros(2, motion.xy.dtype), jnp.zeros((), motion.yaw.dtype))
-    step = lambda T, m: (T @ m, T @ m)
-    _, poses = jax.lax.scan(step, identity, motion)
+    _, poses = jax.lax.scan(lambda T, m: (T @ m, T @ m), identity, motion)
     forward, _, turn = jnp.moveaxis(motion.log(), -1, 0)
-    return (
-        poses,
-        jnp.cumsum(jnp.maximum(turn, 0)),
-        jnp.cumsum(jnp.minimum(turn, 0)),
-        jnp.cumsum(jnp.abs(forward)),
+    totals = jnp.cumsum(
+        jnp.stack([jnp.abs(forward), jnp.maximum(turn, 0), jnp.minimum(turn, 0)]), 1
     )
+
+    before = jnp.append(index[:1], index[:-1])
+    at = lambda i: jax.tree.map(lambda a: a[i], poses)
+    segments = jax.tree.map(lambda a: a[index], log.segments_image)
+    real = jnp.arange(index.shape[0]) < count
+    segments = Segments(segments.endpoints, segments.valid & real[:, None])
+    none = jnp.zeros(segments.valid.shape, int)
+    way = (totals[:, index] - totals[:, before]).T
+    return Keyframes(segments, none, none > 0, at(before).between(at(index)), way)
 
 
 def carry(T_world_robot: SE2, index: np.ndarray, smoothed: SE2) -> SE2:
-    """All poses [T], moved along with their keyframes [n]: the motion in between is kept, and the
-    correction passes over from each keyframe to the next."""
-    t = np.arange(len(T_world_robot.yaw))
-    i = np.clip(np.searchsorted(index, t, side="right") - 1, 0, len(index) - 2)
-    share = jnp.asarray((t - index[i]) / (index[i + 1] - index[i]))
+    """All poses [T], moved along with their keyframes: the motion in between is kept, and the
+    correction passes over from each keyframe to the next.
+
+    **Arguments:**
+    - `index`: the keyframes' images, two at least.
+    - `smoothed`: poses of the keyframes, padded or not.
+    """
+    return _carry(T_world_robot, filled(index), len(index), smoothed)
+
+
+@jax.jit
+def _carry(T_world_robot, index, count, smoothed):
+    t = jnp.arange(T_world_robot.yaw.shape[0])
+    i = jnp.clip(jnp.searchsorted(index, t, side="right") - 1, 0, count - 2)
+    width = jnp.maximum(index[i + 1] - index[i], 1).astype(T_world_robot.yaw.dtype)
+    share = (t - index[i]).astype(width.dtype) / width
     at = lambda T, k: jax.tree.map(lambda a: a[k], T)
     moved = lambda k: at(smoothed, k) @ at(T_world_robot, index[k]).between(T_world_robot)
     before, after = moved(i), moved(i + 1)

@@ -14,7 +14,7 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.observation import Observation
 from sofjax.segment_map import MapRules, SegmentMap, is_raised
-from sofjax.slam import SlamConfig
+from sofjax.slam import FinalMap, SlamConfig
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.extents import reaches
 from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
@@ -31,6 +31,7 @@ class SmoothingRules(eqx.Module):
     step: float = 0.25  # heights of the camera between keyframes ...
     turn: float = 0.1  # ... or radians
     min_sightings: int = 3  # keyframes that a line takes
+    kappa_known: float = 0.03  # standard deviation below which a line may be one of the final map
     seeing: Seeing = Seeing()
 
 
@@ -52,6 +53,7 @@ class Smoothed(eqx.Module):
     index: Int[np.ndarray, "n"]  # the keyframes' images
     mount: Mount  # with what was found of it
     lines: Lines  # [K]
+    endpoints_world: Float[Array, "K 2 2"]  # of the lines, metres
     sightings: Int[Array, "K"]  # segments that show each line
     problem: Problem  # as it stood at the last solution; its keyframes [n'] are padded
     solution: Solution
@@ -87,7 +89,7 @@ def smooth(
         index = kf.choose(path.T_world_robot, float(rules.step * mount.height), float(rules.turn))
         frames = kf.gather(log, index)
         lines = _lines_of_map(config.segment_map, segment_map, int(rules.min_sightings))
-        start = _start(path, index, lines, frames)
+        start = _start(path, index, lines)
         problem = Problem(
             camera, mount, config.motion, rules.priors, frames, lines.anchor, lines.raised, start
         )
@@ -103,15 +105,14 @@ def smooth(
                 problem, lines = _renamed(problem, lines, name)
                 problem, lines, solution = _solved(config.segment_map, rules, problem, lines)
                 costs.append((float(solution.cost_before), float(solution.cost)))
-        found = SE2(
-            *(a[: len(index)] for a in (problem.start.pose[:, :2], problem.start.pose[:, 2]))
-        )
+        pose = problem.start.pose
         return jax.device_get(
             Smoothed(
-                T_world_robot=kf.carry(path.T_world_robot, index, found),
+                T_world_robot=kf.carry(path.T_world_robot, index, SE2(pose[:, :2], pose[:, 2])),
                 index=index,
                 mount=corrected(mount, problem.start.shared),
                 lines=lines,
+                endpoints_world=jax.jit(lambda lines: lines.endpoints_world)(lines),
                 sightings=_sightings(problem.keyframes, lines),
                 problem=problem,
                 solution=solution,
@@ -134,22 +135,23 @@ def _lines_of_map(rules: MapRules, m: SegmentMap, least: int) -> Lines:
     live = np.flatnonzero(np.asarray(m.valid & (m.updates >= least)))
     K = kf.padded(max(len(live), 1))
     slots = np.concatenate([live, np.zeros(K - len(live), int)])
+    return _chosen(rules, m, slots, len(live))
+
+
+@jax.jit
+def _chosen(rules, m, slots, count):
     m = jax.tree.map(lambda a: a[slots], m)
     raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
-    line = jnp.where(raised[:, None], m.line, _on_floor(m.line, m.covariance))
-    return lines_of(m.anchor, line, m.segments_world.endpoints, raised, jnp.arange(K) < len(live))
+    gain = m.covariance[:, :, 2] / m.covariance[:, 2:, 2]
+    on_floor = (m.line + gain * (1 - m.line[:, 2:])).at[:, 2].set(1)
+    line = jnp.where(raised[:, None], m.line, on_floor)
+    real = jnp.arange(slots.shape[0]) < count
+    return lines_of(m.anchor, line, m.segments_world.endpoints, raised, real)
 
 
-def _on_floor(line, covariance):
-    gain = covariance[:, :, 2] / covariance[:, 2:, 2]
-    return (line + gain * (1 - line[:, 2:])).at[:, 2].set(1)
-
-
-def _start(path: Path, index: np.ndarray, lines: Lines, frames: Keyframes) -> Unknowns:
-    n = frames.way.shape[0]
-    filled = np.concatenate([index, np.full(n - len(index), index[-1])])
-    T, tilt = path.T_world_robot, path.tilt
-    pose = jnp.concatenate([T.xy[filled], T.yaw[filled, None], tilt[filled]], axis=1)
+def _start(path: Path, index: np.ndarray, lines: Lines) -> Unknowns:
+    T, tilt, at = path.T_world_robot, path.tilt, kf.filled(index)
+    pose = jnp.concatenate([T.xy[at], T.yaw[at, None], tilt[at]], axis=1)
     return Unknowns(pose, lines.line, jnp.concatenate([jnp.zeros(4), path.bias]))
 
 
@@ -194,6 +196,28 @@ def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
     return eqx.tree_at(lambda p: p.keyframes.line, problem, jnp.asarray(name)[frames.line]), lines
 
 
+@jax.jit
 def _sightings(frames: Keyframes, lines: Lines) -> Int[Array, "K"]:
     K = lines.valid.shape[0]
     return jnp.zeros(K, int).at[jnp.where(frames.known, frames.line, K)].add(1, mode="drop")
+
+
+def final_map(config: SlamConfig, rules: SmoothingRules, smoothed: Smoothed) -> FinalMap:
+    """The lines seen often enough whose height is known, and known to be the floor's.
+
+    What runs along the way of the robot hardly changes its magnification: the top of a baseboard
+    that was only ever passed by is neither told from the floor nor kept.
+    """
+    lines, solution = smoothed.lines, smoothed.solution
+    often = smoothed.sightings >= config.segment_map.min_updates
+    kappa, sigma = solution.kappa_free, solution.kappa_sigma
+    known = sigma < rules.kappa_known
+    with jax.enable_x64(True):
+        found = FinalMap(
+            endpoints_world=jnp.asarray(smoothed.endpoints_world),
+            is_floor=jnp.asarray(lines.valid & ~lines.raised & often & known),
+            updates=jnp.asarray(smoothed.sightings),
+            height=jnp.asarray(smoothed.mount.height * (1 - 1 / kappa)),
+            height_sigma=jnp.asarray(smoothed.mount.height * sigma / kappa**2),
+        )
+        return jax.device_get(found)

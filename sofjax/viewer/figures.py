@@ -11,6 +11,8 @@ MISSING = "matplotlib is not installed, so there is no figure: pip install 'sofj
 
 PATH, ODOMETRY, FLOOR, OTHER, TRUTH = "#c0392b", "#e08e0b", "#1f4e9c", "#d4447c", "#b9c0c7"
 
+ONLINE, ENLARGED = "#e6a49c", 10
+
 
 def available() -> bool:
     """Whether figures can be drawn at all."""
@@ -25,12 +27,16 @@ def draw_map(
     segments: np.ndarray,
     true_robot: np.ndarray | None = None,
     true_segments: np.ndarray | None = None,
+    online: np.ndarray | None = None,
+    ellipses: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
     """Draw the path and the map as a PNG, all in one frame, metres.
 
     **Arguments:**
     - `robot`, `odometry`, `true_robot`: [n, 2] positions.
     - `segments`, `true_segments`: [K, 2, 2] end points.
+    - `online`: [n, 2], the path as it was known while driving, if `robot` is another.
+    - `ellipses`: middles [n, 2] and covariances [n, 2, 2], metres; drawn ten times as large.
     """
     known = [robot, odometry, *segments]
     if true_robot is not None:
@@ -47,7 +53,11 @@ def draw_map(
         axes.plot(*true_robot.T, color="#7f8a94", lw=3.0, zorder=2, label="true path")
     lines(segments, FLOOR, 1.3, f"map: {len(segments)} segments on the floor", 3)
     axes.plot(*odometry.T, color=ODOMETRY, lw=1.3, ls=(0, (4, 2)), zorder=4, label="odometry alone")
+    if online is not None:
+        axes.plot(*online.T, color=ONLINE, lw=1.2, zorder=4, label="estimated while driving")
     axes.plot(*robot.T, color=PATH, lw=1.5, zorder=5, label="estimated path")
+    if ellipses is not None:
+        _draw_ellipses(axes, *ellipses)
     axes.plot(*robot[0], "o", color=PATH, ms=6, zorder=6, label="start")
     axes.plot(*robot[-1], "s", color=PATH, ms=6, zorder=6, label="end")
 
@@ -101,6 +111,18 @@ def draw_images(
     figure.suptitle(title, fontsize=10)
     figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     save(figure, path)
+
+
+def _draw_ellipses(axes, middles: np.ndarray, covariances: np.ndarray) -> None:
+    """Of one standard deviation, enlarged, as closed curves."""
+    circle = np.linspace(0, 2 * np.pi, 41)
+    circle = np.stack([np.cos(circle), np.sin(circle)])
+    label = f"standard deviation × {ENLARGED}"
+    for middle, covariance in zip(middles, covariances, strict=True):
+        size, axis = np.linalg.eigh(covariance)
+        curve = middle[:, None] + ENLARGED * axis @ (np.sqrt(np.maximum(size, 0))[:, None] * circle)
+        axes.plot(*curve, color=PATH, lw=0.7, alpha=0.8, zorder=6, label=label)
+        label = None
 
 
 def _bounds(parts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,123 @@
+"""After the drive: the path and the map once more, with all that was seen in the end."""
+
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sofjax import loop_closure, slam, smoothing
+from sofjax.cli import outputs
+from sofjax.cli.settings import RunSettings
+from sofjax.cli.tally import Closed, Tally
+from sofjax.io.drive import Drive
+from sofjax.io.trajectory import Trajectory, write_trajectory
+from sofjax.slam import SlamState
+
+LOOPS = 4  # solutions at most: one more after each loop that is closed
+
+
+def close(
+    folder: Path, drive: Drive, settings: RunSettings, tally: Tally, state: SlamState
+) -> Closed | None:
+    """By `settings.loop`; None if there is nothing to be found."""
+    if len(tally.stamps) < 2:
+        return None
+    log = jax.tree.map(lambda *leaves: np.stack(leaves), *tally.observations)
+    path = smoothing.Path(
+        tally.T_world_robot, jnp.asarray(np.stack(tally.tilt)), jnp.asarray(tally.bias)
+    )
+    way = {"paper": _by_the_paper, "smooth": _smooth}[settings.loop]
+    begun = time.perf_counter()
+    closed = way(drive, settings, tally, log, path, state)
+    if closed is None or not np.isfinite(closed.trajectory.xy).all():
+        return None
+    closed.report["seconds"] = time.perf_counter() - begun
+    write_trajectory(folder / outputs.SMOOTHED, closed.trajectory)
+    return closed
+
+
+def _smooth(drive, settings, tally, log, path, state) -> Closed:
+    """All poses and lines at once, and again with each loop that was found."""
+    camera, mount = drive.camera_file.camera, drive.camera_file.mount
+    rules, closing = smoothing.SmoothingRules(), loop_closure.ClosingRules()
+    segment_map, asked = state.segment_map, []
+    for _ in range(LOOPS):
+        done = smoothing.smooth(settings.slam, camera, mount, log, path, segment_map, rules)
+        final = smoothing.final_map(settings.slam, rules, done)
+        known = loop_closure.solved(done, final)
+        now = loop_closure.revisits(closing, known)
+        accepted = [revisit for revisit in now if revisit.closing.accepted]
+        asked += accepted[:1] or now
+        if not accepted:
+            break
+        T_world_robot, motion = loop_closure.closed(known, accepted[0])
+        segment_map = loop_closure.joined_map(done, known, motion, accepted[0])
+        path = smoothing.Path(T_world_robot, path.tilt, path.bias)
+    solution, T, n = done.solution, done.T_world_robot, len(done.index)
+    bias = zip(
+        ("distance", "left", "right", "curvature"), solution.unknowns.shared[4:], strict=True
+    )
+    end = np.sqrt(np.diag(solution.pose_covariance[n - 1])[:3])
+    return Closed(
+        Trajectory(np.array(tally.stamps), np.asarray(T.xy), np.unwrap(T.yaw)),
+        final,
+        solution.unknowns.pose[:n, :2],
+        solution.pose_covariance[:n, :2, :2],
+        _revisits_report(asked, tally)
+        | {
+            "keyframes": n,
+            "lines": int(done.lines.valid.sum()),
+            "raised": int((done.lines.valid & done.lines.raised).sum()),
+            "merged": done.merged,
+            "segments": int(done.problem.keyframes.known.sum()),
+            "cost": [{"before": before, "after": after} for before, after in done.costs],
+            "converged": bool(solution.converged),
+            "pixel_sigma": float(done.problem.priors.pixel_sigma),
+            "odometer": {name: float(value) for name, value in bias},
+            "end_sigma": dict(zip(("x_m", "y_m", "yaw_rad"), end.tolist(), strict=True)),
+        },
+    )
+
+
+def _by_the_paper(drive, settings, tally, log, path, state) -> Closed | None:
+    """The error at the end, spread evenly back along the path; nothing if no loop is found."""
+    mount = drive.camera_file.mount
+    final = jax.device_get(eqx.filter_jit(slam.final_map)(settings.slam, mount, state.segment_map))
+    known = loop_closure.driven(path, mount, state.segment_map, final)
+    last = np.array([len(tally.stamps) - 1])
+    asked = loop_closure.revisits(loop_closure.ClosingRules(), known, last)
+    T, endpoints = path.T_world_robot, final.endpoints_world
+    for revisit in asked:
+        if revisit.closing.accepted:
+            T, motion = loop_closure.closed(known, revisit)
+            endpoints = np.asarray(loop_closure.moved_lines(known, motion))
+    return Closed(
+        Trajectory(np.array(tally.stamps), np.asarray(T.xy, float), np.unwrap(T.yaw).astype(float)),
+        eqx.tree_at(lambda f: f.endpoints_world, final, endpoints),
+        np.zeros((0, 2)),
+        np.zeros((0, 2, 2)),
+        _revisits_report(asked, tally) | {"lines": int(state.segment_map.valid.sum())},
+    )
+
+
+def _revisits_report(asked: list[loop_closure.Revisit], tally: Tally) -> dict[str, object]:
+    """Every place that was asked for, and why a loop was closed there or refused."""
+    rows = []
+    for revisit in asked:
+        c = revisit.closing
+        here = jnp.asarray(tally.poses[revisit.image][:2], float)
+        shift = np.hypot(*(c.T_correction.apply(here) - here))
+        row = {"at": tally.stamps[revisit.image], "since": tally.stamps[revisit.since]}
+        row |= {"accepted": c.accepted, "why": c.reason or "one place fits, and no other near it"}
+        row |= {"lines": c.lines, "matched": c.matched, "lead": c.lead}
+        rows.append(row | ({"shift_m": float(shift)} if c.accepted else {}))
+    accepted = sum(row["accepted"] for row in rows)
+    return {
+        "found": len(rows),
+        "accepted": accepted,
+        "refused": len(rows) - accepted,
+        "loops": rows,
+    }

@@ -1,0 +1,19 @@
+"""A place seen again: found by the constellation of its lines, and the drive closed there.
+
+`find` looks for the lines of the last metres among those of long ago, for every pose that the
+uncertainty allows; `distribute` is the paper's closing, the error spread evenly
+back along the path.
+"""
+
+from sofjax.loop_closure.constellation import Closing as Closing
+from sofjax.loop_closure.constellation import ClosingRules as ClosingRules
+from sofjax.loop_closure.constellation import find as find
+from sofjax.loop_closure.revisits import Drive as Drive
+from sofjax.loop_closure.revisits import Revisit as Revisit
+from sofjax.loop_closure.revisits import closed as closed
+from sofjax.loop_closure.revisits import driven as driven
+from sofjax.loop_closure.revisits import joined_map as joined_map
+from sofjax.loop_closure.revisits import moved_lines as moved_lines
+from sofjax.loop_closure.revisits import revisits as revisits
+from sofjax.loop_closure.revisits import solved as solved
+from sofjax.loop_closure.spreading import distribute as distribute
