@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
@@ -24,6 +24,9 @@ class MotionModel(eqx.Module):
     turn_scale_sigma: float = 0.05
     curvature_sigma: float = 0.005  # radians per metre
     bias_drift: float = 0.02  # share of its prior that a systematic error wanders in sqrt(metre)
+    slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
+    slip_distance: float = 0.01  # metres, standard deviation of a slip
+    slip_turn: float = 0.05  # radians
 
 
 class OdometerBias(eqx.Module):
@@ -99,3 +102,33 @@ def sample_motions(
 
     motion, mean, covariance = jax.vmap(one, out_axes=(0, 0, None))(bias.mean, keys)
     return motion, OdometerBias(mean, covariance)
+
+
+SLIPPED = 0.05  # share of the particles that try a slip
+
+
+def sample_slip(
+    model: MotionModel, odometer: SE2, testable: Bool[Array, ""], key: PRNGKeyArray
+) -> tuple[SE2, Float[Array, ""]]:
+    """What one particle supposes that the wheels reported and the robot did not do.
+
+    Slips are rare and large: many more particles try one than their rate says, and weigh less for
+    it, so that without a sighting that tells nothing changes.
+
+    **Arguments:**
+    - `odometer`: T_previous_current as read; a robot that stands does not slip.
+
+    **Returns:** the motion to append to the reading's, mostly none, and the logarithm of its
+    importance weight.
+    """
+    probability = jnp.minimum(model.slip_rate * jnp.abs(odometer.log()[0]), SLIPPED)
+    possible = testable & (probability > 0)
+    key_which, key_size = jax.random.split(key)
+    slips = possible & (jax.random.uniform(key_which) < SLIPPED)
+    forward, turn = jax.random.normal(key_size, (2,))
+    slip = jnp.stack([model.slip_distance * forward, jnp.zeros(()), model.slip_turn * turn])
+    probability = jnp.where(possible, probability, SLIPPED)
+    log_weight = jnp.where(
+        slips, jnp.log(probability / SLIPPED), jnp.log1p(-probability) - jnp.log1p(-SLIPPED)
+    )
+    return SE2.exp(jnp.where(slips, slip, 0)), jnp.where(possible, log_weight, 0)

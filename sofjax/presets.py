@@ -20,6 +20,7 @@ PAPER = SlamConfig(
         distance_scale_sigma=0.0,
         turn_scale_sigma=0.0,
         curvature_sigma=0.0,
+        slip_rate=0.0,
     ),
     sensor=SensorModel(propagate=False, rho_sigma=0.05, theta_sigma=0.035, tilt_sigma=0.0),
     segment_map=MapRules(

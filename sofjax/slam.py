@@ -11,7 +11,7 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 from sofjax.likelihood import SensorModel, adapt_noise, compare, log_density, sight
-from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions
+from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions, sample_slip
 from sofjax.observation import Observation
 from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
 from sofjax.segment_map import (
@@ -25,6 +25,7 @@ from sofjax.segment_map import (
 )
 from sofjax.sof import SofExtraction, extract
 
+SURE = 1.5  # noise up to which the sensor may convict the wheels of a slip
 LOST_AFTER = 10  # images without one known segment
 KNOWN = 0.5  # prior probability that a segment on the floor is one of the map; of the soft form
 
@@ -118,14 +119,18 @@ def step(
     """One round of Fig. 6. Pure; compiled once for all images of one capacity."""
     rules, sensor = config.segment_map, config.sensor
     N = config.filter.particles
-    key, key_motion, key_choice = jax.random.split(state.key, 3)
+    key, key_motion, key_slip, key_choice = jax.random.split(state.key, 4)
 
     # 1-3) move, and sample N particles by the motion model
     motion, bias = sample_motions(
         config.motion, state.particles.bias, observation.motion, jax.random.split(key_motion, N)
     )
-    T_world_robot = state.particles.T_world_robot @ motion
-    moved = Particles(T_world_robot, bias, state.particles.log_weight)
+    slip, log_ratio = jax.vmap(sample_slip, in_axes=(None, None, None, 0))(
+        config.motion, observation.motion, state.noise < SURE, jax.random.split(key_slip, N)
+    )
+    T_world_robot = state.particles.T_world_robot @ motion @ slip
+    prior = state.particles.log_weight + log_ratio
+    moved = Particles(T_world_robot, bias, prior - jax.nn.logsumexp(prior))
     predicted = mean_pose(moved)
 
     # 4) put the segments on the floor, and extract SoF (Fig. 5) against a view a baseline away

@@ -35,7 +35,7 @@ from sofjax.geometry.lines import line_point_distance, polar_in_frame, polar_thr
 from sofjax.geometry.segments import clip
 from sofjax.geometry.two_view import transfer_segment
 from sofjax.likelihood import Candidates, SensorModel, Sightings, compare, sight
-from sofjax.motion import MotionModel, prior_bias, sample_motion
+from sofjax.motion import MotionModel, prior_bias, sample_motion, sample_slip
 from sofjax.segment_map import MapRules, appear, believed
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -310,6 +310,18 @@ BELIEF = [0.01, 0.02, 0.01, -0.02, 0.03, 0.002]  # two noises, four systematic e
 def test_gradients_of_a_drawn_motion(twist):
     """By the odometer's reading, the noise and the belief: a filter can be tuned by them."""
     assert_right(drawn, [*twist, *BELIEF], rtol=1e-4)
+
+
+def slipped(p):
+    model = eqx.tree_at(lambda m: (m.slip_distance, m.slip_turn), MotionModel(), (p[3], p[4]))
+    keys = jax.random.split(jax.random.key(0), 40)  # two of them try a slip
+    slip = lambda key: sample_slip(model, SE2.exp(p[:3]), jnp.array(True), key)
+    return jax.vmap(slip)(keys)
+
+
+@pytest.mark.parametrize("twist", [[0.3, 0.01, 0.2], [0.0, 0.0, 0.0], [0.0, 0.0, 0.1]])
+def test_gradients_of_a_slip_are_finite(twist):
+    assert_finite(slipped, [*twist, 0.01, 0.05])
 
 
 @pytest.mark.parametrize("twist", [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.1]])

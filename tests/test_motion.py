@@ -7,7 +7,15 @@ import pytest
 from conftest import jit_quickly
 
 from sofjax.geometry import SE2
-from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, sample_motions
+from sofjax.motion import (
+    SLIPPED,
+    MotionModel,
+    OdometerBias,
+    prior_bias,
+    sample_motion,
+    sample_motions,
+    sample_slip,
+)
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -170,3 +178,38 @@ def test_many_particles_are_each_drawn_by_its_own_key():
         np.testing.assert_allclose(motion.xy[i], alone.xy)
         np.testing.assert_allclose(motion.yaw[i], alone.yaw)
         np.testing.assert_allclose(learned.mean[i], learned_alone.mean)
+
+
+def slips(model, odometer, testable=True):
+    """Twists of N particles, and their importance weights."""
+    each = jax.vmap(sample_slip, in_axes=(None, None, None, 0))
+    slip, log_weight = jax.jit(each)(
+        model, odometer, jnp.array(testable), jax.random.split(jax.random.key(2), N)
+    )
+    return np.asarray(slip.log()), np.exp(np.asarray(log_weight))
+
+
+def test_slips_are_tried_often_and_weigh_as_rarely_as_they_happen():
+    model = MotionModel(slip_rate=0.05, slip_distance=0.02, slip_turn=0.1)
+    twist, weight = slips(model, reading(0.4, 0, 0.1))
+    slipped = twist[:, 2] != 0
+    assert slipped.mean() == pytest.approx(SLIPPED, abs=0.01)
+    assert weight.mean() == pytest.approx(1, abs=0.01)
+    assert (weight * slipped).mean() == pytest.approx(0.05 * 0.4, rel=0.2)
+    assert twist[slipped, 0].std() == pytest.approx(0.02, rel=0.1)
+    assert twist[slipped, 2].std() == pytest.approx(0.1, rel=0.1)
+    assert (twist[~slipped] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "odometer", "testable"),
+    [
+        (MotionModel(slip_rate=0.0), (0.4, 0, 0.1), True),
+        (MotionModel(), (0.0, 0, 0), True),
+        (MotionModel(), (0.4, 0, 0), False),
+    ],
+)
+def test_nothing_slips(model, odometer, testable):
+    twist, weight = slips(model, reading(*odometer), testable)
+    assert (twist == 0).all()
+    assert (weight == 1).all()

@@ -155,6 +155,18 @@ def test_the_odometer_s_distance_error_is_learned():
     assert info.bias[-1, 0] == pytest.approx(1 / 1.03 - 1, abs=0.012)
 
 
+def test_a_wheel_that_spins_is_found_out():
+    """The odometer reports a turn of 3 degrees that the robot never made."""
+    true, observations = drive()
+    spun = eqx.tree_at(
+        lambda o: o.motion.yaw, observations, observations.motion.yaw.at[T // 2].add(np.radians(3))
+    )
+    _, infos = stepped(jax.tree.map(lambda a, i=i: a[i], spun) for i in range(T))
+    error = np.degrees(np.asarray(infos.T_world_robot.yaw) - true[:, 2])
+    assert abs(error[T // 2 + 3 :]).max() < 0.6
+    assert trajectory_error(infos.T_world_robot.xy) < 0.02
+
+
 def test_a_scan_is_one_step_after_the_other():
     """In float64: the compiler rounds a loop's body otherwise, and resampling magnifies that."""
     # indices of top_k stay int32
@@ -247,7 +259,7 @@ def test_the_map_counts_what_was_born():
 
 
 def test_black_images_leave_the_map_as_it_is_and_follow_the_odometer():
-    silent = MotionModel(*[0.0] * 8)
+    silent = MotionModel(*[0.0] * 11)
     config = dataclasses.replace(CONFIG, motion=silent)
     state, _ = stepped(map(frame, range(8)), config)
     motions = jax.tree.map(lambda a: a[8:20], drive()[1].motion)
