@@ -112,6 +112,24 @@ def init(
     )
 
 
+def distribute(state: SlamState, mesh: jax.sharding.Mesh) -> SlamState:
+    """Every device of a mesh takes its share of the particles, and a copy of all else.
+
+    `step` and `run` then compute where their particles are, on one device or on those of several
+    processes (`jax.distributed`), which begin with the same state. N must be a multiple of the
+    number of devices.
+    """
+    N = state.particles.log_weight.shape[0]
+    if N % mesh.size:
+        raise ValueError(f"{N} particles cannot be shared alike by {mesh.size} devices")
+    shared = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(mesh.axis_names))
+    copied = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+    where = lambda p: (p.T_world_robot.xy, p.T_world_robot.yaw, p.bias.mean, p.log_weight)
+    places = jax.tree.map(lambda _: copied, state)
+    places = eqx.tree_at(lambda s: where(s.particles), places, (shared,) * 4)
+    return jax.jit(lambda state: state, out_shardings=places)(state)
+
+
 @jax.jit
 def step(
     config: SlamConfig, camera: Camera, mount: Mount, state: SlamState, observation: Observation
