@@ -396,3 +396,29 @@ def test_the_final_map_worked_by_hand():
     assert not found.is_floor[n:].any()
     np.testing.assert_allclose(found.height[3], 0.6 - 0.6 / 1.2, rtol=1e-5)
     np.testing.assert_allclose(found.height_sigma[:n], 0.6 * sigma / kappa**2, rtol=1e-4)
+
+
+def test_runs_side_by_side_are_the_runs_one_by_one():
+    """Seeds, settings, mounts and drives of one length under vmap; float64 as above."""
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        as_float64 = functools.partial(
+            jax.tree.map, lambda a: a.astype(float) if a.dtype == "float32" else a
+        )
+        camera, mount, log = as_float64((CAMERA, MOUNT, drive()[1]))
+        logs = [jax.tree.map(lambda a, i=i: a[i : i + 14], log) for i in (0, 5)]
+        several = [  # pixel_sigma, height, key, drive
+            (jnp.array(0.5), jnp.array(0.6), jax.random.key(0), logs[0]),
+            (jnp.array(0.8), jnp.array(0.62), jax.random.key(1), logs[1]),
+        ]
+
+        def run(pixel_sigma, height, key, log):
+            config = eqx.tree_at(lambda c: c.sensor.pixel_sigma, CONFIG, pixel_sigma)
+            at = eqx.tree_at(lambda m: m.height, mount, height)
+            return slam.run(config, camera, at, slam.init(config, camera, at, key, M), log)
+
+        stacked = jax.tree.map(lambda *a: jnp.stack(a), *several)
+        together, alone = jit_quickly(jax.vmap(run))(*stacked), jit_quickly(run)
+        for i, each in enumerate(several):
+            one = jax.tree.map(operator.itemgetter(i), together)
+            for a, b in zip(numbers(one), numbers(alone(*each)), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
