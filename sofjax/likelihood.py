@@ -161,7 +161,8 @@ def compare(
     **Arguments:**
     - `T_predicted_foot`: the hypothetical foot in the predicted foot's frame, in which the
       candidates are given: near the origin, where the polar form is accurate.
-    - `used`: which sightings count, of each particle's own SoF extraction.
+    - `used`: which sightings may match, of each particle's own SoF extraction. The others cost
+      e_max too: a pose must not win by taking nothing for floor.
     """
     difference = _difference(sightings, candidates, T_predicted_foot)
     loose = mahalanobis(difference, candidates.precision_tilt)
@@ -175,8 +176,7 @@ def compare(
     tilt, _, prior = _solve_tilt(sensor, sightings.tilt, d, W)
     tight = mahalanobis(d - sightings.tilt @ tilt, W)
     error = jnp.where(inlier, jnp.minimum(tight, sensor.e_max), sensor.e_max)
-    counted = used & sightings.valid
-    log_likelihood = -0.5 * (jnp.sum(jnp.where(counted, error, 0)) + prior)
+    log_likelihood = -0.5 * (jnp.sum(jnp.where(sightings.valid, error, 0)) + prior)
     return Comparison(log_likelihood, choice, error, tilt)
 
 

@@ -13,10 +13,7 @@ DEFAULT = SlamConfig()
 PAPER = SlamConfig(
     association=Association(baseline_distance=0.0, baseline_angle=0.0),
     motion=MotionModel(
-        distance_noise=0.02,
-        lateral_noise=0.005,
-        heading_noise=0.02,
-        turn_noise=0.05,
+        turn_noise=0.05,  # the odometer's systematic errors are noise to it
         distance_scale_sigma=0.0,
         turn_scale_sigma=0.0,
         curvature_sigma=0.0,

@@ -225,7 +225,8 @@ def test_the_likelihood_is_the_loop_over_all_pairs(rng):
         used = rng.random(len(near)) < 0.8
         T = rng.normal(size=3) * 0.02
         found = compare_pose(STIFF, *as_arrays(*problem), pose(*T), jnp.asarray(used))
-        expected = reference.log_likelihood(near, used, as_lists(*rest), STIFF.e_max, T)
+        own = [[] if not may else some for may, some in zip(used, as_lists(*rest), strict=True)]
+        expected = reference.log_likelihood(near, [True] * len(near), own, STIFF.e_max, T)
         assert found.log_likelihood == pytest.approx(expected, rel=1e-9)
         np.testing.assert_array_equal(found.tilt, 0)
         inliers += int((found.error < STIFF.e_max).sum())
@@ -288,7 +289,7 @@ def test_an_empty_map_costs_e_max_for_every_segment_wherever_the_robot_is(rng):
         assert found.log_likelihood == pytest.approx(-6 * STIFF.e_max / 2)
 
 
-def test_what_is_not_used_or_not_valid_counts_nothing(rng):
+def test_what_is_not_valid_counts_nothing_and_what_may_not_match_costs_the_most(rng):
     near, lines, kappa, W, valid = random_problem(rng)
     mask = np.array([True, False, True, True, False, True])
     expected = reference.log_likelihood(
@@ -308,10 +309,10 @@ def test_what_is_not_used_or_not_valid_counts_nothing(rng):
         sightings.tilt,
     )
     invalid = compare_pose(STIFF, padded, candidates, SE2.identity(), jnp.ones(6, bool))
-    for found in (unused, invalid):
-        assert found.log_likelihood == pytest.approx(expected)
+    assert invalid.log_likelihood == pytest.approx(expected)
+    assert unused.log_likelihood == pytest.approx(expected - 2 * 9.0 / 2)
     nothing = compare_pose(STIFF, sightings, candidates, SE2.identity(), jnp.zeros(6, bool))
-    assert nothing.log_likelihood == 0
+    assert nothing.log_likelihood == pytest.approx(-6 * 9.0 / 2)
 
 
 def test_the_choice_is_the_candidate_that_costs_least(rng):

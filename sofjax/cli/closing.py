@@ -12,10 +12,12 @@ from sofjax import loop_closure, slam, smoothing
 from sofjax.cli import outputs
 from sofjax.cli.settings import RunSettings
 from sofjax.cli.tally import Closed, Tally
+from sofjax.evaluation import align
 from sofjax.io.drive import Drive
 from sofjax.io.trajectory import Trajectory, write_trajectory
 from sofjax.slam import SlamState
 
+SPREAD = 0.5  # metres about its middle that a path needs to show a direction
 LOOPS = 4  # solutions at most: one more after each loop that is closed
 
 
@@ -34,9 +36,30 @@ def close(
     closed = way(drive, settings, tally, log, path, state)
     if closed is None or not np.isfinite(closed.trajectory.xy).all():
         return None
+    closed = _in_the_frame_of(np.array(tally.poses, float)[:, :2], closed)
     closed.report["seconds"] = time.perf_counter() - begun
     write_trajectory(folder / outputs.SMOOTHED, closed.trajectory)
     return closed
+
+
+def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
+    """Moved so that its path [T, 2] lies nearest to the one known while driving.
+
+    No image says where the world's axes are; so the map serves both paths.
+    """
+    if np.sqrt(driven.var(axis=0).sum()) < SPREAD:
+        return closed
+    path = closed.trajectory
+    motion = align(path.xy, driven)
+    return Closed(
+        Trajectory(path.stamps, motion.apply(path.xy), path.yaw + motion.yaw),
+        eqx.tree_at(
+            lambda f: f.endpoints_world, closed.final, motion.apply(closed.final.endpoints_world)
+        ),
+        motion.apply(closed.places),
+        motion.R @ closed.covariances @ motion.R.T,
+        closed.report,
+    )
 
 
 def _smooth(drive, settings, tally, log, path, state) -> Closed:

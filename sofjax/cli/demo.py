@@ -66,11 +66,12 @@ def page(report: dict, drive: Path, pictures: bool) -> str:
 
     errors, images = report["errors"], report["images"]["done"]
     odometry, found, of_map = errors["odometry"], errors["trajectory"], errors["map"]
+    columns = (odometry, found, errors.get("smoothed") or found)
     middle = sorted((drive / "rgb").iterdir())[images // 5].name
 
     def row(name: str, key: str, unit: str, digits: int) -> str:
-        wheels, sofjax = (f"{errors[key]:.{digits}f} {unit}" for errors in (odometry, found))
-        return f"<tr><th>{name}</th><td>{wheels}</td><td>{sofjax}</td></tr>"
+        cells = "".join(f"<td>{errors[key]:.{digits}f} {unit}</td>" for errors in columns)
+        return f"<tr><th>{name}</th>{cells}</tr>"
 
     def picture(source: str, what: str) -> str:
         if pictures:
@@ -99,10 +100,12 @@ mislead.</p>
 {picture(IMAGES, "segments on the floor and others")}
 <h2>Where it went, and the map that it made on the way</h2>
 <p>Dashed is the path by the odometer alone: the corners turn in too far, and errors grow. Red is
-the estimate; grey, mostly hidden under it, is the truth. Blue are the segments of the map.</p>
+the estimate; grey, mostly hidden under it, is the truth. Blue are the segments of the map. After
+the drive, all poses and all lines were solved for at once, so that what was seen again at the end
+of the loop lies where it was first seen.</p>
 {picture("run/map.png", "the path and the map")}
 <table>
-<tr><th></th><th>odometer alone</th><th>sofjax</th></tr>
+<tr><th></th><th>odometer alone</th><th>while driving</th><th>solved afterwards</th></tr>
 {row("position, root mean square", "ate_m", "m", 3)}
 {row("of the path", "ate_percent", "%", 2)}
 {row("heading, root mean square", "yaw_deg", "°", 2)}
