@@ -42,6 +42,7 @@ _MODULES += (
     "batch",
     "smoothing",
     "loop_closure",
+    "calibration",
     "observation",
     "evaluation",
     "io",

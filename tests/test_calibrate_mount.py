@@ -9,14 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
+from sofjax.calibration import UNKNOWNS
 from sofjax.cli import main
-from sofjax.cli.calibrate_mount import free_names
+from sofjax.cli.calibrate_mount import FREE, free_names
 from sofjax.geometry import Mount
 from sofjax.io.camera_file import read_camera
 from sofjax.vision import rectify
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 TILT = math.radians(15)
+
+
+def test_what_may_be_freed_is_what_the_fit_knows():
+    assert FREE == UNKNOWNS
 
 
 def make_drive(folder, images):

@@ -92,7 +92,13 @@ def test_a_segment_shows_the_nearest_line_that_reaches_it():
     assert ahead.all()
     unknowns = Unknowns(jnp.zeros((1, 5)), lines.line, jnp.zeros(8))
     index, known = associate(
-        Seeing(), CAMERA, MOUNT, lines, unknowns, Segments(image[None], jnp.ones((1, 3), bool))
+        Seeing(),
+        8.0,
+        CAMERA,
+        MOUNT,
+        lines,
+        unknowns,
+        Segments(image[None], jnp.ones((1, 3), bool)),
     )
     assert known.tolist() == [[True, False, False]]
     assert index[0, 0] == 0

@@ -20,7 +20,6 @@ import numpy as np
 import optimistix as optx
 
 from sofjax.calibration import PairNoise, expected, fit_mount
-from sofjax.calibration.fit import robust
 from sofjax.calibration.pairs import distances, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
 from sofjax.geometry import (
@@ -31,6 +30,7 @@ from sofjax.geometry import (
     two_view_homography,
 )
 from sofjax.simulation import Detection, Odometer, Scene, make_world, observe, random_rig, take_ride
+from sofjax.smoothing.problem import robust
 
 NOISE, CAPACITY, IMAGES = 0.5, 1024, 160
 EXACT = Odometer(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)

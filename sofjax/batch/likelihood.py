@@ -58,7 +58,8 @@ def log_likelihood(
     - `segment_map`: K segments in the world, metres.
     - `sigma_rho`, `sigma_theta`: metres and radians, noise of every pair.
     - `e_max`: the cost of an observed segment that meets nothing.
-    - `used`: which observed segments count for which particle, where the choice depends on it.
+    - `used`: which observed segments count for which particle, where the choice depends on it. What
+      does not count costs nothing: of particles with different choices the sums do not compare.
     - `covariance`: of (rho, theta) of each observed segment, added to that of the sigmas.
     - `prune`: False evaluates every pair, for comparison.
 

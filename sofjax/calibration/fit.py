@@ -15,6 +15,7 @@ from sofjax.calibration.pairs import (
     start_at,
 )
 from sofjax.geometry.camera import Camera, Mount
+from sofjax.smoothing.problem import robust
 
 MOUNT = ("height", "pitch", "roll")  # what is free unless told otherwise
 
@@ -48,14 +49,6 @@ class CalibrationResult(eqx.Module):
     result: optx.RESULTS  # of the solver; an estimate that did not converge is the best so far
 
 
-def robust(r: Float[Array, "4"], scale: Float[Array, ""] | float) -> Float[Array, "4"]:
-    """Residuals whose square grows as |r| beyond `scale`, smooth everywhere (pseudo-Huber).
-
-    The four distances of a pair are two equations said from both sides: they count half.
-    """
-    return r * jnp.sqrt(1 / (1 + jnp.sqrt(1 + jnp.sum(r**2) / 2 / scale**2)))
-
-
 def fit_mount(
     camera: Camera, mount: Mount, pairs: Pairs, rules: FitRules = DEFAULT, max_steps: int = 60
 ) -> CalibrationResult:
@@ -87,7 +80,8 @@ def _fit(
         by = jnp.where(is_free, by, 0)
         r = all_distances(camera, start.moved(by), pairs) / pairs.sigma
         r = jnp.where(pairs.valid[:, None], r, 0)
-        return jax.vmap(robust, in_axes=(0, None))(r, loss_scale)
+        # the four distances of a pair are two equations said from both sides: they count half
+        return jax.vmap(robust, in_axes=(0, None))(r / 2**0.5, loss_scale)
 
     def with_priors(by, _):
         return residuals(by, pairs), jnp.where(is_free, by / prior, by)

@@ -38,7 +38,7 @@ def fit_jointly(
     sigma = tuple(
         WIDE[name] * u if name in free else 0.0 for name, u in zip(WIDE, unit, strict=True)
     )
-    rules = dataclasses.replace(rules, priors=dataclasses.replace(rules.priors, mount_sigma=sigma))
+    rules = dataclasses.replace(rules, mount_sigma=sigma)
     with jax.enable_x64(False):
         single = lambda tree: jax.tree.map(_single, tree)
         camera_, mount_, log_ = single(camera), single(mount), single(log)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sofjax.vision import Frontend, FrontendSettings
 
 REFUSED = 3  # exit code: all was read, and nothing can be known from it
+# calibration.UNKNOWNS, which would take the parser a second to import
 FREE = ("height", "pitch", "roll", "yaw", "distance", "turn")
 BY_DEFAULT = "height,pitch,roll"
 

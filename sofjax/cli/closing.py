@@ -19,7 +19,7 @@ from sofjax.slam import SlamState
 
 TOLD = 0.4  # share of lines that must fit where a user says that the drive ends as a loop
 SPREAD = 0.5  # metres about its middle that a path needs to show a direction
-LOOPS = 4  # solutions at most: one more after each loop that is closed
+SOLUTIONS = 4  # at most: one more after each loop that is closed
 
 
 def close(
@@ -68,7 +68,7 @@ def _smooth(drive, settings, tally, log, path, state) -> Closed:
     camera, mount = drive.camera_file.camera, drive.camera_file.mount
     rules, closing = smoothing.SmoothingRules(), loop_closure.ClosingRules()
     segment_map, asked = state.segment_map, []
-    for _ in range(LOOPS):
+    for _ in range(SOLUTIONS):
         done = smoothing.smooth(settings.slam, camera, mount, log, path, segment_map, rules)
         final = smoothing.final_map(settings.slam, rules, done)
         known = loop_closure.solved(done, final)

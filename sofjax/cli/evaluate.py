@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     estimate = read_trajectory(args.folder / outputs.TRAJECTORY, "the trajectory of the run")
     errors, motion = evaluate_trajectory(truth, estimate)
     smoothed = None
-    if (args.folder / outputs.SMOOTHED).exists():  # the map is of its frame
+    if (args.folder / outputs.SMOOTHED).exists():  # of which the map is a part
         path = args.folder / outputs.SMOOTHED
         estimate = read_trajectory(path, "the smoothed trajectory of the run")
         smoothed, motion = evaluate_trajectory(truth, estimate)

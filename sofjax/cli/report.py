@@ -95,7 +95,7 @@ def _compare(drive: Drive, tally: Tally, results: Results) -> RigidMotion | None
     except InputError as error:
         results.warnings.append(f"no errors against the truth: {error}")
         return None
-    if results.closed:  # the map is of its frame
+    if results.closed:  # of which the map is a part
         estimate = results.closed.trajectory
         results.smoothed, motion = evaluate_trajectory(drive.groundtruth, estimate)
     if drive.floor_segments is not None:

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 
 from sofjax import presets
+from sofjax.cli.run import LOOPS
 from sofjax.io.errors import InputError, nearest
 from sofjax.io.settings import INLINE, read_toml, to_dict, with_settings
 from sofjax.slam import SlamConfig
@@ -14,7 +15,7 @@ FRONTENDS = {"paper": FrontendSettings(detector="hough")}  # of a preset; the de
 CLOSINGS = {"paper": "none"}  # likewise; the paper closes by hand, where it knows of a loop
 
 CHOICES = {
-    "loop": ("none", "paper", "smooth"),
+    "loop": LOOPS,
     "frontend.detector": tuple(DETECTORS),
     "filter.choice": ("resample", "winner"),
     "segment_map.rule": ("kalman", "gamma"),

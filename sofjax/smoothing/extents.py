@@ -7,15 +7,17 @@ from jaxtyping import Array, Bool, Float
 from sofjax.geometry.floor import floor_homography, segment_to_floor
 from sofjax.geometry.lines import PolarLine, direction
 from sofjax.geometry.se2 import SE2
-from sofjax.smoothing.lines import foot_mount
-from sofjax.smoothing.problem import Problem, corrected
-
-RANGE = 5.0  # R, metres: what is farther does not extend a line
+from sofjax.smoothing.problem import Problem, corrected, foot_mount
 
 
 @jax.jit
-def places(problem: Problem) -> tuple[Float[Array, "n M 2"], Bool[Array, "n M"]]:
+def places(
+    problem: Problem, radius: Float[Array, ""] | float
+) -> tuple[Float[Array, "n M 2"], Bool[Array, "n M"]]:
     """Places along its line, metres from the anchor, between which each segment lies.
+
+    **Arguments:**
+    - `radius`: R, metres: what is farther does not count.
 
     **Returns:** the places in order, and which segments show a line within range at all.
     """
@@ -28,7 +30,7 @@ def places(problem: Problem) -> tuple[Float[Array, "n M 2"], Bool[Array, "n M"]]
 
         def of_segment(ends, k):
             line = u.line[k]
-            on_floor, some = segment_to_floor(H_F, ends, jnp.asarray(RANGE, ends.dtype))
+            on_floor, some = segment_to_floor(H_F, ends, jnp.asarray(radius, ends.dtype))
             # a raised line is seen magnified about the foot
             anchor = jax.tree.map(lambda a: a[k], problem.anchor)
             local = (anchor.between(T_world_foot)).apply(on_floor / line[2])
@@ -41,9 +43,11 @@ def places(problem: Problem) -> tuple[Float[Array, "n M 2"], Bool[Array, "n M"]]
 
 
 @jax.jit
-def reaches(problem: Problem) -> tuple[Float[Array, "K 2"], Bool[Array, "K"]]:
+def reaches(
+    problem: Problem, radius: Float[Array, ""] | float
+) -> tuple[Float[Array, "K 2"], Bool[Array, "K"]]:
     """First and last place at which each line was seen, and whether it was."""
-    place, some = places(problem)
+    place, some = places(problem, radius)
     K = problem.start.line.shape[0]
     index = jnp.where(some, problem.keyframes.line, K)
     low = jnp.full(K, jnp.inf).at[index].min(place[..., 0], mode="drop")

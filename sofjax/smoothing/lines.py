@@ -11,7 +11,7 @@ from sofjax.geometry.lines import PolarLine, cofactor, direction, line_point_dis
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments, overlap
 from sofjax.segment_map import appear
-from sofjax.smoothing.problem import Unknowns, corrected
+from sofjax.smoothing.problem import Unknowns, corrected, foot_mount
 
 
 class Lines(eqx.Module):
@@ -47,20 +47,16 @@ class Seeing(eqx.Module):
     gate: float = 3.0  # pixels that an end may be off its line
     angle: float = 0.15  # radians between a segment and its line in the image
     join_gap: float = 0.1  # metres that a segment may lie beyond what was seen of its line
-    max_depth: float = 8.0  # metres: what is farther is not used
-
-
-def foot_mount(mount: Mount, pose: Float[Array, "5"]) -> Mount:
-    """The mount about the foot, with the wobble of a keyframe."""
-    zero = jnp.zeros_like(mount.height)
-    return Mount(zero, zero, mount.height, mount.pitch + pose[3], mount.roll + pose[4], mount.yaw)
 
 
 def associate(
-    seeing: Seeing, camera: Camera, mount: Mount, lines: Lines, unknowns: Unknowns,
-    segments_image: Segments,
+    seeing: Seeing, max_depth: Float[Array, ""] | float, camera: Camera, mount: Mount,
+    lines: Lines, unknowns: Unknowns, segments_image: Segments,
 ) -> tuple[Int[Array, "n M"], Bool[Array, "n M"]]:  # fmt: skip
     """For each segment of each keyframe the line that lies nearest to both of its ends, in pixels.
+
+    **Arguments:**
+    - `max_depth`: metres; what is farther is not used.
 
     **Returns:** the line's index, and whether there is one within the gates.
     """
@@ -79,7 +75,7 @@ def associate(
         length = jnp.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=1)[:, None]
 
         on_floor, some = jax.vmap(segment_to_floor, in_axes=(None, 0, None))(
-            H_F, endpoints, jnp.asarray(seeing.max_depth, pose.dtype)
+            H_F, endpoints, jnp.asarray(max_depth, pose.dtype)
         )
         apparent = T_world_foot.inverse().apply(ends_world) * seen[:, 2, None, None]
         shared = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))

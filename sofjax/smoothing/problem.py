@@ -41,12 +41,7 @@ class Priors(eqx.Module):
     pixel_sigma: float = 0.5  # pixels
     loss_scale: float = 3.0  # residuals, in sigmas, from which they count linearly only
     tilt_sigma: float = 0.001  # radians
-    mount_sigma: tuple[float, float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )  # height, pitch, roll, yaw
+    mount_sigma: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # height, pitch, roll, yaw
     kappa_sigma: float = 0.3  # of a line that is not on the floor
 
 
@@ -89,6 +84,12 @@ def corrected(mount: Mount, shared: Float[Array, "8"]) -> Mount:
     )
 
 
+def foot_mount(mount: Mount, pose: Float[Array, "5"]) -> Mount:
+    """The mount about the foot, with the wobble of a keyframe."""
+    zero = jnp.zeros_like(mount.height)
+    return Mount(zero, zero, mount.height, mount.pitch + pose[3], mount.roll + pose[4], mount.yaw)
+
+
 def pixel_residual(
     problem: Problem,
     pose: Float[Array, "5"],
@@ -102,15 +103,12 @@ def pixel_residual(
     T_world_foot = SE2(pose[:2], pose[2]) @ mount.T_robot_foot
     seen, _ = appear(line, anchor, T_world_foot)
     L = jnp.stack([-jnp.sin(seen[1]), jnp.cos(seen[1]), -seen[0]])
-    zero = jnp.zeros_like(mount.x)
-    at_foot = Mount(
-        zero, zero, mount.height, mount.pitch + pose[3], mount.roll + pose[4], mount.yaw
-    )
-    l = cofactor(floor_homography(problem.camera, at_foot, SE2.identity())) @ L
+    H_F = floor_homography(problem.camera, foot_mount(mount, pose), SE2.identity())
+    l = cofactor(H_F) @ L
     return jax.vmap(line_point_distance, in_axes=(None, 0))(l, segment_image)
 
 
-def robust(r: Float[Array, "2"], scale: Float[Array, ""] | float) -> Float[Array, "2"]:
+def robust(r: Float[Array, "d"], scale: Float[Array, ""] | float) -> Float[Array, "d"]:
     """Residuals whose square grows as |r| beyond `scale`, smooth everywhere (pseudo-Huber)."""
     return r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + jnp.sum(r**2) / scale**2)))
 
@@ -180,7 +178,7 @@ def residuals(unknowns: Unknowns, problem: Problem) -> Residuals:
     return Residuals(
         pixels=pixels,
         odometer=jnp.concatenate([first, odometer]),
-        tilt=unknowns.pose[:, 3:] / priors.tilt_sigma,
+        tilt=unknowns.pose[:, 3:] / jnp.maximum(priors.tilt_sigma, FIXED),
         line=(unknowns.line - centre) / line_sigma,
         shared=unknowns.shared / jnp.maximum(shared_sigma, FIXED),
     )

@@ -26,7 +26,8 @@ from sofjax.smoothing.solution import Solution, solve
 class SmoothingRules(eqx.Module):
     """When a drive is smoothed, and how."""
 
-    priors: Priors = Priors()
+    mount_sigma: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # height, pitch, roll, yaw; 0: fixed
+    loss_scale: float = 3.0  # residuals, in sigmas, from which they count linearly only
     rounds: int = eqx.field(static=True, default=3)  # of association and solution
     step: float = 0.25  # heights of the camera between keyframes ...
     turn: float = 0.1  # ... or radians
@@ -75,35 +76,43 @@ def smooth(
     In float64, whatever the caller's precision is.
 
     **Arguments:**
-    - `config`: with which the filter ran.
-    - `mount`: from which the fit starts, and at which it stays if `rules.priors` leaves it fixed.
+    - `config`: with which the filter ran; what it says of noise, range and heights holds here.
+    - `mount`: from which the fit starts, and at which it stays where `rules.mount_sigma` is zero.
     - `log`: the drive's observations, leading T, of two images or more.
     - `path`, `segment_map`: as the filter left them.
 
     **Returns:** the last round's solution; `solution.converged` says whether it settled.
     """
+    priors = _priors(config, rules)
     with jax.enable_x64(True):
-        config, camera, mount, log, path, segment_map, rules = map(
-            _in_double, (config, camera, mount, log, path, segment_map, rules)
+        config, camera, mount, log, path, segment_map, rules, priors = map(
+            _in_double, (config, camera, mount, log, path, segment_map, rules, priors)
         )
         index = kf.choose(path.T_world_robot, float(rules.step * mount.height), float(rules.turn))
         frames = kf.gather(log, index)
         lines = _lines_of_map(config.segment_map, segment_map, int(rules.min_sightings))
         start = _start(path, index, lines)
         problem = Problem(
-            camera, mount, config.motion, rules.priors, frames, lines.anchor, lines.raised, start
+            camera,
+            mount,
+            config.motion,
+            priors,
+            frames,
+            lines.anchor,
+            lines.raised,
+            start,
         )
         costs, merged = [], 0
         for _ in range(rules.rounds):
-            problem = _associated(rules.seeing, problem, lines)
-            problem, lines, solution = _solved(config.segment_map, rules, problem, lines)
+            problem = _associated(rules.seeing, config.filter.max_depth, problem, lines)
+            problem, lines, solution = _solved(config, problem, lines)
             costs.append((float(solution.cost_before), float(solution.cost)))
             into, joins = doubles(lines, solution.joint, _sightings(problem.keyframes, lines))
             if joins.any():
                 merged += int(joins.sum())
                 name = representatives(np.asarray(into), np.asarray(joins))
                 problem, lines = _renamed(problem, lines, name)
-                problem, lines, solution = _solved(config.segment_map, rules, problem, lines)
+                problem, lines, solution = _solved(config, problem, lines)
                 costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
         return jax.device_get(
@@ -120,6 +129,16 @@ def smooth(
                 merged=merged,
             )
         )
+
+
+def _priors(config: SlamConfig, rules: SmoothingRules) -> Priors:
+    return Priors(
+        pixel_sigma=config.sensor.pixel_sigma,
+        loss_scale=rules.loss_scale,
+        tilt_sigma=config.sensor.tilt_sigma,
+        mount_sigma=rules.mount_sigma,
+        kappa_sigma=config.segment_map.kappa_sigma,
+    )
 
 
 def _in_double(tree):
@@ -156,24 +175,25 @@ def _start(path: Path, index: np.ndarray, lines: Lines) -> Unknowns:
 
 
 @jax.jit
-def _associated(seeing: Seeing, problem: Problem, lines: Lines) -> Problem:
+def _associated(seeing: Seeing, max_depth, problem: Problem, lines: Lines) -> Problem:
     """With the segments' lines as they are by the present estimate."""
     found = associate(
-        seeing, problem.camera, problem.mount, lines, problem.start,
+        seeing, max_depth, problem.camera, problem.mount, lines, problem.start,
         problem.keyframes.segments_image,
     )  # fmt: skip
     return eqx.tree_at(lambda p: (p.keyframes.line, p.keyframes.known), problem, found)
 
 
-def _solved(rules: MapRules, smoothing: SmoothingRules, problem: Problem, lines: Lines):
+def _solved(config: SlamConfig, problem: Problem, lines: Lines):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
     solution = solve(problem)
-    return *_settled(rules, smoothing, problem, lines, solution), solution
+    return *_settled(config, problem, lines, solution), solution
 
 
 @jax.jit
-def _settled(rules, smoothing, problem, lines, solution):
+def _settled(config, problem, lines, solution):
+    rules = config.segment_map
     kappa, sigma = solution.kappa_free, solution.kappa_sigma
     outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
     raised = outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
@@ -182,9 +202,9 @@ def _settled(rules, smoothing, problem, lines, solution):
     unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
     problem = eqx.tree_at(lambda p: p.start, problem, unknowns)
     # believe the pixels less where they disagree more than they should
-    sigma = jnp.maximum(misfit(problem), smoothing.priors.pixel_sigma)
+    sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
     problem = eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
-    reach, seen = reaches(problem)
+    reach, seen = reaches(problem, rules.range)
     reach = jnp.where(seen[:, None], reach, lines.reach)
     return problem, Lines(lines.anchor, line, reach, raised, lines.valid)
 
