@@ -28,7 +28,8 @@ class SensorModel(eqx.Module):
     theta_sigma: float = 0.02  # radians; ... unused
     theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
     adaptation: float = 0.3  # share of the surplus misfit by which the noise grows in a step
-    noise_max: float = 100.0  # multiple of the variance beyond which it does not grow
+    noise_gate: float = 4.0  # multiple of the variance up to which it widens what may match; ...
+    noise_max: float = 1e4  # ... up to here it only lessens the weight of the sightings
     e_max: float = 9.0  # cost of an observed segment that matches nothing
 
 
@@ -107,11 +108,26 @@ def adapt_noise(
 
     A mount that is only roughly known, a rolling shutter or blur make all of them inconsistent,
     and a filter that is too sure of its sensor then leaves the odometer. Matched errors e have
-    the mean 2; the noise never falls below the sensor model's, nor grows so far that nothing
-    is ever matched again.
+    the mean 2; the noise never falls below the sensor model's, nor grows so far that the sensor
+    could not be trusted again.
     """
     grown = noise * jnp.exp(sensor.adaptation * (misfit / 2 - 1))
     return jnp.clip(grown, 1, sensor.noise_max)
+
+
+def pixels_and_weight(
+    sensor: SensorModel, noise: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """What the noise makes of the pixels' variance, as a multiple, and of the likelihood's weight.
+
+    What pixels do not explain is systematic, as the tilt of a mount that is degrees off: it does
+    not average out over segments and images, and wider gates would only take neighbours for one
+    another. So beyond `noise_gate` the logarithm of the likelihood counts less instead, until the
+    odometer alone decides.
+    """
+    return jnp.minimum(noise, sensor.noise_gate), sensor.noise_gate / jnp.maximum(
+        noise, sensor.noise_gate
+    )
 
 
 class Candidates(eqx.Module):

@@ -10,7 +10,14 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-from sofjax.likelihood import SensorModel, adapt_noise, compare, log_density, sight
+from sofjax.likelihood import (
+    SensorModel,
+    adapt_noise,
+    compare,
+    log_density,
+    pixels_and_weight,
+    sight,
+)
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions, sample_slip
 from sofjax.observation import Observation
 from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
@@ -152,8 +159,9 @@ def step(
     predicted = mean_pose(moved)
 
     # 4) put the segments on the floor, and extract SoF (Fig. 5) against a view a baseline away
+    variance, weight = pixels_and_weight(sensor, state.noise)
     sightings = sight(
-        sensor, camera, mount, observation.segments_image, config.filter.max_depth, state.noise
+        sensor, camera, mount, observation.segments_image, config.filter.max_depth, variance
     )
     view = _view_a_baseline_away(config.association, state, predicted)
     sof = lambda T: extract(
@@ -175,7 +183,9 @@ def step(
         of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, lines)
         log_likelihood = jax.vmap(of_soft)(feet, used)
     else:
-        log_likelihood = jax.vmap(lambda T, use: of_pose(T, use).log_likelihood)(feet, used)
+        log_likelihood = weight * jax.vmap(lambda T, use: of_pose(T, use).log_likelihood)(
+            feet, used
+        )
     log_weight = moved.log_weight + log_likelihood
     log_evidence = jax.nn.logsumexp(log_weight)
     weighted = Particles(T_world_robot, bias, log_weight - log_evidence)

@@ -15,6 +15,7 @@ from sofjax.likelihood import (
     adapt_noise,
     compare,
     mahalanobis,
+    pixels_and_weight,
     sight,
 )
 
@@ -372,4 +373,17 @@ def test_noise_is_believed_where_matches_disagree_and_never_below_the_model():
     assert noise(1.0, 4.0) == pytest.approx(np.exp(0.5))
     assert 1 < noise(3.0, 0.5) < 3
     assert noise(1.0, 0.0) == 1
-    assert noise(50.0, 9.0) == sensor.noise_max  # grown so far, it could never match again
+    assert noise(8e3, 9.0) == sensor.noise_max  # grown so far, it could not be trusted again
+
+
+def test_noise_beyond_the_gate_takes_weight_and_lets_no_more_match():
+    sensor = SensorModel(noise_gate=4.0)
+    for noise, variance, weight in (
+        (1.0, 1.0, 1.0),
+        (3.0, 3.0, 1.0),
+        (4.0, 4.0, 1.0),
+        (40.0, 4.0, 0.1),
+    ):
+        assert [float(x) for x in pixels_and_weight(sensor, jnp.array(noise))] == pytest.approx(
+            [variance, weight]
+        )

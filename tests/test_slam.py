@@ -337,6 +337,17 @@ def test_no_input_makes_a_number_that_is_none(segments):
             assert_finite((state, info))
 
 
+def test_a_sensor_that_stays_inconsistent_leaves_it_to_the_odometer():
+    state, _ = stepped(map(frame, range(20)))
+    size = {}
+    for noise in (1.0, CONFIG.sensor.noise_max):
+        doubted = eqx.tree_at(lambda s: s.noise, state, jnp.full_like(state.noise, noise))
+        _, info = step(CONFIG, CAMERA, MOUNT, doubted, frame(20))
+        size[noise] = float(info.effective_size)
+        assert info.matched > 0  # so that it can be trusted again
+    assert size[1.0] < 0.7 * N < 0.95 * N < size[CONFIG.sensor.noise_max]
+
+
 def test_the_weights_stay_normalised():
     state, info = default_run()
     assert jax.nn.logsumexp(state.particles.log_weight) == pytest.approx(0, abs=1e-4)

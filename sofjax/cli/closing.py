@@ -1,5 +1,8 @@
 """After the drive: the path and the map once more, with all that was seen in the end."""
 
+import ctypes
+import gc
+import sys
 import time
 from pathlib import Path
 
@@ -32,6 +35,7 @@ def close(
     path = smoothing.Path(
         tally.T_world_robot, jnp.asarray(np.stack(tally.tilt)), jnp.asarray(tally.bias)
     )
+    _make_room()
     way = {"paper": _by_the_paper, "smooth": _smooth}[settings.loop]
     begun = time.perf_counter()
     closed = way(drive, settings, tally, log, path, state)
@@ -41,6 +45,14 @@ def close(
     closed.report["seconds"] = time.perf_counter() - begun
     write_trajectory(folder / outputs.SMOOTHED, closed.trajectory)
     return closed
+
+
+def _make_room() -> None:
+    """What the drive was compiled with goes: else compiling the solution tops it by a third."""
+    jax.clear_caches()
+    gc.collect()
+    if sys.platform == "linux":  # freed, but kept by the C library
+        getattr(ctypes.CDLL(None), "malloc_trim", lambda pad: 0)(0)
 
 
 def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
