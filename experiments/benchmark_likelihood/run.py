@@ -7,7 +7,7 @@
 A problem holds particles [N, 3] (x, y, yaw), observed [M, 4] (x1 y1 x2 y2, robot frame, metres),
 map [K, 4] (world), observed_valid [M], map_valid [K], sigma_rho, sigma_theta and e_max. With
 --problem the log-likelihoods are written to --out, and what the library's own choice costs is
-`cpu_ms`.
+`cpu_ms`; without it --out is a folder, for the figures as JSON and drawn.
 """
 
 import argparse
@@ -15,11 +15,16 @@ import json
 import platform
 import resource
 import statistics
+import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))
+import common
 
 from sofjax import batch
 from sofjax.geometry.camera import Camera, Mount
@@ -249,12 +254,25 @@ def show(title: str, figures: dict) -> None:
         )
 
 
+def draw(problems: dict, path: Path) -> None:
+    plot, axes = common.pyplot().subplots(figsize=(8, 5), layout="constrained")
+    forms = list(next(iter(problems.values())))
+    for i, (title, figures) in enumerate(problems.items()):
+        at = np.arange(len(forms)) + 0.8 * i / len(problems)
+        axes.barh(at, [figures[f]["cpu_ms"] for f in forms], 0.8 / len(problems), label=title)
+    axes.set_yticks(np.arange(len(forms)) + 0.3, forms)
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel="CPU milliseconds of a call")
+    axes.legend(fontsize=8)
+    plot.savefig(path, dpi=110)
+
+
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--problem", metavar="FILE.npz", help="evaluate this instead of the table")
-    parser.add_argument("--out", metavar="FILE.npz", help="where log_likelihood [N] goes")
+    parser.add_argument("--out", type=Path, help="FILE.npz for log_likelihood [N], or a folder")
     parser.add_argument("--size", metavar="NxMxK", help="one problem of this size")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=15)
@@ -285,6 +303,9 @@ def main():
             title = "x".join(map(str, size)) + ", " + cloud
             problems[title] = benchmark(make_problem(*size, cloud, options.seed), rounds)
         result["problems"] = problems
+        if options.out:
+            common.save(options.out, "benchmark_likelihood", options, result)
+            draw(problems, options.out / "benchmark_likelihood.png")
     result["peak_memory_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     if options.json:
         print(json.dumps(result, indent=1))

@@ -1,15 +1,13 @@
 """Which residual fits the mount best: rho and theta of eq. (9), or distances of the end points?
 
-    python run.py [--quick] [--json FILE]
+    python experiments/mount_residuals/run.py [--quick] [--logs 200] [--seed FIRST] [--out DIR]
 
 Logs of floor segments with 0.5 px noise from the simulator: random rigs in random worlds, exact
 odometry, no vibration. Tracks and pairs are the same for all residuals, and so is the solver.
 """
 
-import argparse
 import dataclasses
-import json
-import platform
+import sys
 import time
 from pathlib import Path
 
@@ -18,6 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+
+sys.path.append(str(Path(__file__).parents[1]))
+import common
 
 from sofjax.calibration import PairNoise, expected, fit_mount
 from sofjax.calibration.pairs import distances, start_at
@@ -153,16 +154,13 @@ def no_odometer():
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--quick", action="store_true", help="20 logs in the place of 200")
-    parser.add_argument("--json", metavar="FILE", type=Path)
+    parser = common.options(__doc__, __file__)
+    parser.add_argument("--logs", type=int, default=200)
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    begun, done, seed = time.time(), [], 0
-    logs = 20 if args.quick else 200
-    while len(done) < logs and seed < 3 * logs:
+    begun, done, seed = time.time(), [], args.seed
+    logs = 4 if args.quick else args.logs
+    while len(done) < logs and seed < args.seed + 3 * logs:
         found = study(seed)
         done += [found] if found else []
         seed += 1
@@ -178,7 +176,7 @@ def main() -> None:
             "times_bound": np.sqrt(np.mean((error / least) ** 2, axis=0)).tolist(),
             "inside_2_sigma": np.mean(np.abs(error) < 2 * sigma, axis=0).tolist(),
         }
-    print(f"{len(done)} logs of {seed}, pairs {min(d[2] for d in done)} to "
+    print(f"{len(done)} logs of {seed - args.seed}, pairs {min(d[2] for d in done)} to "
           f"{max(d[2] for d in done)}; {time.time() - begun:.0f} s")  # fmt: skip
     print("| residual | height | pitch | roll | times the bound | inside 2 sigma |\n|" + "---|" * 6)
     for name, row in table.items():
@@ -186,10 +184,24 @@ def main() -> None:
         inside = ", ".join(f"{100 * v:.0f} %" for v in row["inside_2_sigma"])
         print(f"| {name} | {row['height_mm']:.1f} mm | {row['pitch_mrad']:.2f} mrad | "
               f"{row['roll_mrad']:.2f} mrad | {times} | {inside} |")  # fmt: skip
-    if args.json:
-        args.json.write_text(
-            json.dumps({"logs": len(done), "machine": platform.machine(), "fits": table}, indent=1)
-        )
+    pairs = [d[2] for d in done]
+    common.save(
+        args.out, "mount_residuals", args, {"logs": len(done), "pairs": pairs, "fits": table}
+    )
+    draw(table, args.out / "mount_residuals.png")
+
+
+def draw(table: dict, path: Path) -> None:
+    plot, axes = common.pyplot().subplots(figsize=(7, 3.2), layout="constrained")
+    for i, name in enumerate(("height", "pitch", "roll")):
+        at = np.arange(len(table)) + 0.25 * (i - 1)
+        axes.barh(at, [row["times_bound"][i] for row in table.values()], 0.25, label=name)
+    axes.set_yticks(range(len(table)), list(table))
+    axes.invert_yaxis()
+    axes.axvline(1, color="black", lw=0.8)
+    axes.set_xlabel("root mean square error, times the Cramér-Rao bound")
+    axes.legend()
+    plot.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

@@ -8,15 +8,14 @@ Writes `paper.png` (Figs. 8 and 9 by the settings of the paper and by the defaul
 and the folder of every run; a run that is there already is not repeated.
 """
 
-import argparse
 import json
+import sys
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.collections import LineCollection
+
+sys.path.append(str(Path(__file__).parents[1]))
+import common
 
 from sofjax.cli.main import main as sofjax
 from sofjax.evaluation import align
@@ -69,7 +68,7 @@ def figures_of(report: dict) -> dict:
 
 def draw(drive_folder: Path, out: Path, figures: dict) -> None:
     drive = read_drive(drive_folder)
-    plot, all_axes = plt.subplots(2, 2, figsize=(12, 12), sharex=True, sharey=True)
+    plot, all_axes = common.pyplot().subplots(2, 2, figsize=(12, 12), sharex=True, sharey=True)
     for name, axes in zip(FIGURE, all_axes.flat, strict=True):
         folder, f = out / name, figures[name]
         smoothed = folder / "trajectory_smoothed.txt"
@@ -93,19 +92,14 @@ def draw(drive_folder: Path, out: Path, figures: dict) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, required=True)
+    parser = common.options(__doc__, __file__)
     parser.add_argument("--drive", type=Path, help="instead of a simulated one")
-    parser.add_argument("--seed", type=int, default=0, help="of the world and of the filter")
-    parser.add_argument("--quick", action="store_true", help="a short corridor, the figure's runs")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     drive = options.drive or options.out / "drive"
     if not (drive / "rgb.txt").exists():
-        world = "l" if options.quick else "paper"
-        if sofjax(["simulate", "--world", world, "--seed", str(options.seed), "--out", str(drive)]):
+        world = ["--world", "l", "--images", "60"] if options.quick else ["--world", "paper"]
+        if sofjax(["simulate", *world, "--seed", str(options.seed), "--out", str(drive)]):
             raise SystemExit(2)
     figures = {}
     for name, (_, settings) in RUNS.items():
@@ -123,9 +117,8 @@ def main() -> None:
             f"{f['segments']:9d} {f['precision'] or 0:10.2f} {f['recall'] or 0:7.2f} "
             f"{f['loops']:6d}"
         )
-    (options.out / "paper.json").write_text(
-        json.dumps({"drive": str(drive), "odometry": odometry, "runs": figures}, indent=1)
-    )
+    result = {"drive": drive, "odometry": odometry, "runs": figures}
+    common.save(options.out, "paper", options, result)
     draw(drive, options.out, figures)
 
 

@@ -1,24 +1,27 @@
 """A hundred random worlds, each driven once and run at the default settings of `sofjax run`.
 
-    python run.py [--worlds N] [--first SEED] [--results results.csv] [--set name=value ...]
+    python experiments/random_worlds/run.py [--worlds N] [--seed FIRST] [--set name=value ...]
 
 World, robot, camera and odometer are those of `sofjax simulate --world random --seed S`. Worlds
-that the results hold already are skipped, so an interrupted run goes on where it was; the drives
-themselves are not kept. Ends with the distribution of the error.
+that OUT/results.csv holds already are skipped, so an interrupted run goes on where it was; the
+drives themselves are not kept. Ends with the distribution of the error.
 """
 
-import argparse
 import contextlib
 import csv
 import io
 import json
 import math
+import sys
 import tempfile
 import time
 import traceback
 from pathlib import Path
 
 import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))
+import common
 
 from sofjax.cli import main as sofjax
 from sofjax.simulation import make_world
@@ -31,7 +34,7 @@ COLUMNS = (
 FLOORS = {"mark": "blocks", "grout": "tiles", "plank": "planks", "stripe": "stripes"}
 
 
-def one(seed: int, folder: Path, settings: list[str]) -> dict[str, object]:
+def one(seed: int, folder: Path, few: list[str], settings: list[str]) -> dict[str, object]:
     """Simulate and run one world; `failure` says what went wrong, if anything did."""
     begun = time.perf_counter()
     drive, out = folder / f"world-{seed}", folder / f"run-{seed}"
@@ -39,9 +42,8 @@ def one(seed: int, folder: Path, settings: list[str]) -> dict[str, object]:
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            codes = [
-                sofjax(["simulate", "--world", "random", "--seed", str(seed), "--out", str(drive)])
-            ]
+            world = ["--world", "random", "--seed", str(seed), *few]
+            codes = [sofjax(["simulate", *world, "--out", str(drive)])]
             codes += [sofjax(["run", str(drive), "--out", str(out), *settings])]
         if any(codes):
             row["failure"] = f"exit codes {codes}: {said.getvalue()[-300:]!r}"
@@ -122,41 +124,55 @@ def summary(results: Path) -> str:
     return "\n".join(lines)
 
 
+def draw(rows: list[dict[str, str]], path: Path) -> None:
+    plot, axes = common.pyplot().subplots(figsize=(6.5, 4), layout="constrained")
+    floors = sorted({row["floor"] for row in rows})
+    for floor in floors:
+        mine = [row for row in rows if row["floor"] == floor]
+        x, y = ([float(row[k]) for row in mine] for k in ("odometry_percent", "ate_percent"))
+        axes.plot(x, y, "o", ms=4, label=floor)
+    reach = [0.9 * min(float(row["ate_percent"]) for row in rows), 4]
+    axes.plot(reach, reach, color="grey", lw=0.8)
+    axes.set(xscale="log", yscale="log", xlabel="odometry, % of the path",
+             ylabel="while driving, % of the path", title=f"{len(rows)} random worlds")  # fmt: skip
+    axes.legend(fontsize=8)
+    plot.savefig(path, dpi=110)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = common.options(__doc__, __file__)
     parser.add_argument("--worlds", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--results", type=Path, default=Path(__file__).with_name("results.csv"))
     parser.add_argument(
         "--set", metavar="name=value", nargs="+", default=[], help="of `sofjax run`"
     )
     args = parser.parse_args()
     settings = ["--set", *args.set] if args.set else []
-    known = set()
-    if args.results.exists():
-        known = {int(row["seed"]) for row in csv.DictReader(args.results.open())}
-    for seed in range(args.first, args.first + args.worlds):
+    worlds, few = (2, ["--images", "60"]) if args.quick else (args.worlds, [])
+    results, known = args.out / ("quick.csv" if args.quick else "results.csv"), set()
+    args.out.mkdir(parents=True, exist_ok=True)
+    if results.exists():
+        known = {int(row["seed"]) for row in csv.DictReader(results.open())}
+    for seed in range(args.seed, args.seed + worlds):
         if seed in known:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            row = one(seed, Path(folder), settings)
-        with args.results.open("a", newline="") as file:
+            row = one(seed, Path(folder), few, settings)
+        with results.open("a", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS, restval="")
             if file.tell() == 0:
                 writer.writeheader()
             row = {name: f"{v:.5g}" if isinstance(v, float) else v for name, v in row.items()}
             writer.writerow(row)
-        print(
-            seed,
-            row["floor"],
-            row.get("ate_percent"),
-            row["failure"],
-            f"{row['seconds']} s",
-            flush=True,
-        )
-    print(summary(args.results))
+        told = (seed, row["floor"], row.get("ate_percent"), row["failure"])
+        print(*told, f"{row['seconds']} s", flush=True)
+    print(summary(results))
+    rows = list(csv.DictReader(results.open()))
+    common.save(args.out, "random_worlds", args, {"worlds": rows})
+    done = [row for row in rows if not row["failure"]]
+    if done:
+        draw(done, args.out / "random_worlds.png")
+    if len(done) < len(rows):
+        sys.exit(f"{len(rows) - len(done)} of {len(rows)} failed")
 
 
 if __name__ == "__main__":

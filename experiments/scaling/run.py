@@ -1,19 +1,80 @@
-"""One filter on several processes, its particles shared by jax.distributed; against one process.
+"""What a step costs, by particles, segments of an image, slots of the map, and processes.
 
-    python run.py [--processes 2] [--particles 4096] [--images 40]
+    python experiments/scaling/run.py [--quick] [--images 20] [--out DIR]
 
-On one machine this shows that the results are the same, not that it is faster: one process uses
-all its cores already. On a cluster, start `--worker RANK --address HOST:PORT` on each machine.
+One stretch of a drive is run with one size changed at a time; compiling is told apart. The last
+part shares the particles of one filter among processes by jax.distributed, against one process:
+on one machine this shows that the results are the same, not that it is faster, as one process
+uses all cores already. On a cluster, start `--worker RANK --address HOST:PORT` on each machine.
 """
 
-import argparse
 import json
 import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
+
+sys.path.append(str(Path(__file__).parents[1]))
+import common
+
+USUAL = {"particles": 1000, "segments": 64, "map": 1024}
+SIZES = {
+    "particles": (10, 100, 1000, 10_000, 100_000),
+    "segments": (8, 16, 32, 64, 128),
+    "map": (64, 256, 1024, 4096),
+}
+FEW = {"particles": (10, 1000), "segments": (16, 64), "map": (64,)}
+
+
+def measure(seed: int, images: int, particles: int, segments: int, map: int) -> dict[str, float]:
+    """Milliseconds of a step, after it was compiled; and what compiling took."""
+    import jax
+    import jax.numpy as jnp
+
+    from sofjax import slam
+    from sofjax.geometry import Segments
+
+    drive = common.random_drive("random", seed, images)
+    seen = drive.observations.segments_image
+    fill = np.resize(np.arange(common.M), segments)  # more are the same again
+    observations = jax.tree.map(jnp.asarray, drive.observations)
+    repeated = Segments(seen.endpoints[:, fill], seen.valid[:, fill])
+    observations = type(observations)(repeated, observations.motion, observations.overflow)
+    config = common.config_of(filter={"particles": particles}, segment_map={"capacity": map})
+    camera, mount = drive.camera, drive.mount
+    state = slam.init(config, camera, mount, jax.random.key(seed), segments)
+    begun = time.process_time()
+    compiled = slam.run.lower(config, camera, mount, state, observations).compile()
+    compiling = time.process_time() - begun
+    call = lambda: jax.block_until_ready(compiled(config, camera, mount, state, observations))
+    call()
+    cpu, wall = [], []
+    for _ in range(3):
+        c, w = time.process_time(), time.perf_counter()
+        call()
+        cpu.append(time.process_time() - c)
+        wall.append(time.perf_counter() - w)
+    return {
+        "cpu_ms": 1e3 * min(cpu) / images,
+        "wall_ms": 1e3 * min(wall) / images,
+        "compile_cpu_s": compiling,
+        "scratch_mib": compiled.memory_analysis().temp_size_in_bytes / 2**20,
+    }
+
+
+def draw(table: dict, path: Path) -> None:
+    plot, axes = common.pyplot().subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+    for axis, (name, rows) in zip(axes, table.items(), strict=True):
+        sizes = [int(size) for size in rows]
+        for key, label in (("cpu_ms", "CPU"), ("wall_ms", "wall")):
+            axis.plot(sizes, [row[key] for row in rows.values()], "o-", ms=4, label=label)
+        others = ", ".join(f"{v} {k}" for k, v in USUAL.items() if k != name)
+        axis.set(xscale="log", yscale="log", xlabel=name, ylabel="ms a step", title=others)
+        axis.legend()
+    plot.savefig(path, dpi=110)
 
 
 def work(args):
@@ -23,25 +84,13 @@ def work(args):
     if args.processes > 1:
         jax.distributed.initialize(args.address, args.processes, args.worker)
 
-    import dataclasses
-
-    from sofjax import PRESETS, slam
-    from sofjax.simulation import Scene, make_world, observe, random_rig, take_ride
+    from sofjax import slam
 
     # the same in every process: a drive seen as segments, and the first state
-    world, rig = make_world("random", args.seed), random_rig(args.seed)
-    ride = take_ride(world, rig, args.seed, most_images=args.images)
-    camera, mount = rig.camera_file.camera, rig.camera_file.mount
-    key = jax.random.key(args.seed)
-    see = jax.jit(observe)
-    log = see(Scene.of(world), camera, ride.mounts, ride.poses(), ride.motions(), key)
-    config = PRESETS["default"]
-    config = dataclasses.replace(
-        config,
-        filter=dataclasses.replace(config.filter, particles=args.particles),
-        segment_map=dataclasses.replace(config.segment_map, capacity=128),
-    )
-    state = slam.init(config, camera, mount, key, 64)
+    drive = common.random_drive("random", args.seed, args.images)
+    camera, mount, log = drive.camera, drive.mount, drive.observations
+    config = common.config_of(filter={"particles": 1024}, segment_map={"capacity": 128})
+    state = slam.init(config, camera, mount, jax.random.key(args.seed), common.M)
 
     auto = (jax.sharding.AxisType.Auto,)
     mesh = jax.make_mesh((jax.device_count(),), ("particles",), axis_types=auto)
@@ -64,8 +113,7 @@ def start(args, processes):
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     command = [sys.executable, __file__, "--processes", str(processes), "--address", address]
-    command += ["--particles", str(args.particles), "--images", str(args.images)]
-    command += ["--seed", str(args.seed)]
+    command += ["--images", str(args.images), "--seed", str(args.seed)]
     workers = [
         subprocess.Popen([*command, "--worker", str(rank)], stdout=subprocess.PIPE, text=True)
         for rank in range(processes)
@@ -77,21 +125,29 @@ def start(args, processes):
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = common.options(__doc__, __file__)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--particles", type=int, default=4096)
-    parser.add_argument("--images", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--images", type=int, default=20)
     parser.add_argument("--worker", type=int, metavar="RANK")
     parser.add_argument("--address", metavar="HOST:PORT")
     args = parser.parse_args()
     if args.worker is not None:
         return work(args)
+    args.images = 10 if args.quick else args.images
+    table = {}
+    for name, sizes in (FEW if args.quick else SIZES).items():
+        table[name] = {}
+        for size in sizes:
+            row = measure(args.seed, args.images, **USUAL | {name: size})
+            table[name][size] = row
+            print(f"{size:7d} {name:10s}" + "".join(f"{k} {v:9.2f}   " for k, v in row.items()),
+                  flush=True)  # fmt: skip
     one, many = start(args, 1), start(args, args.processes)
     apart = float(np.abs(np.array(one.pop("xy")) - np.array(many.pop("xy"))).max())
-    print(json.dumps({"one": one, "many": many, "furthest_apart_m": apart}, indent=1))
+    processes = {"one": one, "many": many, "furthest_apart_m": apart}
+    print(json.dumps(processes, indent=1))
+    common.save(args.out, "scaling", args, {"steps": table, "processes": processes})
+    draw(table, args.out / "scaling.png")
 
 
 if __name__ == "__main__":

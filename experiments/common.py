@@ -1,0 +1,186 @@
+"""What the experiments share: their options, drives seen as segments, batches of runs, results."""
+
+import argparse
+import dataclasses
+import datetime
+import functools
+import json
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sofjax import PRESETS, slam
+from sofjax.evaluation import align, evaluate_trajectory
+from sofjax.geometry import SE2, Camera, Mount
+from sofjax.io.trajectory import Trajectory
+from sofjax.observation import Observation
+from sofjax.simulation import Detection, Scene, make_world, observe, random_rig, take_ride
+
+M = 64  # segments an image
+LSD = Detection()
+
+
+def options(doc: str, file: str) -> argparse.ArgumentParser:
+    """The options that all experiments have; `file` is the script."""
+    folder = Path("runs") / Path(file).parent.name
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="a minute or so, to see that it works")
+    parser.add_argument("--seed", type=int, default=0, help="the first of the seeds")
+    parser.add_argument("--out", type=Path, default=folder, help=f"default: {folder}/")
+    return parser
+
+
+def save(out: Path, name: str, args: argparse.Namespace, results: dict) -> None:
+    """`<name>.json`: the results, and by what they were made."""
+    out.mkdir(parents=True, exist_ok=True)
+    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or None
+    made = {
+        "date": datetime.date.today().isoformat(),
+        "commit": commit,
+        "machine": f"{os.cpu_count()} cores, {platform.machine()}, {jax.default_backend()}",
+        "jax": jax.__version__,
+        "options": {key: value for key, value in vars(args).items() if key != "out"},
+    }
+    text = json.dumps({"made": made} | results, indent=1, default=_plain)
+    (out / f"{name}.json").write_text(text + "\n")
+
+
+def _plain(value):
+    return str(value) if isinstance(value, Path) else np.asarray(value).tolist()
+
+
+def config_of(preset: str = "default", **changes: dict[str, object]) -> slam.SlamConfig:
+    """A preset with some settings changed: `config_of(filter={"particles": 300})`."""
+    config = PRESETS[preset]
+    parts = {
+        part: dataclasses.replace(getattr(config, part), **given) for part, given in changes.items()
+    }
+    return dataclasses.replace(config, **parts)
+
+
+class Drive(NamedTuple):
+    """A ride seen as segments, without images."""
+
+    camera: Camera
+    mount: Mount
+    observations: Observation  # leading T
+    truth: Trajectory
+    odometry: Trajectory  # at the images
+
+
+def take_drive(world, rig, seed: int, images: int | None = None, detection=LSD) -> Drive:
+    """Drive `rig` through `world` and see it as segments."""
+    ride = take_ride(world, rig, seed, most_images=images)
+    camera, mount = rig.camera_file.camera, rig.camera_file.mount
+    edges = sum(
+        len(kind.contrast)
+        for kind in (world.floor_segments, world.raised_segments, world.reflections)
+    )
+    scene = Scene.of(world, edges=2048 * -(-edges // 2048), walls=64 * -(-len(world.walls) // 64))
+    T = len(ride.truth.stamps)
+    padded = lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -T % 100, axis=0)])
+    given = jax.tree.map(padded, (ride.mounts, ride.poses(), ride.motions()))
+    seen = _observe(scene, camera, *given, jax.random.key(seed), detection)
+    observations = jax.tree.map(lambda leaf: np.asarray(leaf[:T]), seen)
+    return Drive(camera, mount, observations, ride.truth, ride.odometry.at(ride.truth.stamps))
+
+
+@jax.jit
+def _observe(scene, camera, mounts, poses, motions, key, detection):
+    return observe(scene, camera, mounts, poses, motions, key, detection, capacity=M)
+
+
+def random_drive(name: str, seed: int, images: int | None = None) -> Drive:
+    """A world of that name and a robot unlike others, both by the seed."""
+    return take_drive(make_world(name, seed), random_rig(seed), seed, images)
+
+
+def stack(drives: list[Drive]) -> tuple[Camera, Mount, Observation]:
+    """Drives as one batch; the shorter ones stand still and see nothing at their end."""
+    T = max(len(drive.truth.stamps) for drive in drives)
+    T = 50 * -(-T // 50)  # fewer lengths to compile for
+    pad = lambda leaf: np.pad(leaf, [(0, T - len(leaf))] + [(0, 0)] * (leaf.ndim - 1))
+    logs = [jax.tree.map(pad, drive.observations) for drive in drives]
+    each = [(d.camera, d.mount, log) for d, log in zip(drives, logs, strict=True)]
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(a) for a in leaves]), *each)
+
+
+@eqx.filter_jit
+def run_batch(config, camera, mount, observations, keys):
+    """The filter on every drive of a batch, each with its key.
+
+    **Returns:** the infos and the covariances [drives, T, 3, 3] of the particles' (x, y, yaw).
+    """
+
+    def one(camera, mount, observations, key):
+        state = slam.init(config, camera, mount, key, M)
+
+        def step(state, observation):
+            state, info = slam.step(config, camera, mount, state, observation)
+            return state, (info, spread(state.particles))
+
+        return jax.lax.scan(step, state, observations)[1]
+
+    return jax.vmap(one)(camera, mount, observations, keys)
+
+
+def spread(particles) -> jax.Array:
+    """Covariance [3, 3] of the particles in (x, y, yaw) of the world."""
+    T = particles.T_world_robot
+    poses = jnp.concatenate([T.xy, T.yaw[:, None]], axis=1)
+    w = jnp.exp(particles.log_weight)
+    d = poses - w @ poses
+    return (w[:, None] * d).T @ d
+
+
+def path_of(drive: Drive, poses: SE2) -> Trajectory:
+    """Estimates (leading T or more) as a trajectory."""
+    T = len(drive.truth.stamps)
+    xy, yaw = (np.asarray(a, float)[:T] for a in (poses.xy, poses.yaw))
+    return Trajectory(drive.truth.stamps, xy, yaw)
+
+
+def errors_of(drive: Drive, poses: SE2):
+    """`TrajectoryErrors` of the estimates."""
+    return evaluate_trajectory(drive.truth, path_of(drive, poses))[0]
+
+
+def odometry_errors(drive: Drive):
+    return evaluate_trajectory(drive.truth, drive.odometry)[0]
+
+
+def one_of(batch, i: int):
+    return jax.tree.map(lambda leaf: leaf[i], batch)
+
+
+def true_in_start(drive: Drive) -> np.ndarray:
+    """True poses [T, 3] in the frame of the first, which is where the filter begins."""
+    c, s = np.cos(drive.truth.yaw[0]), np.sin(drive.truth.yaw[0])
+    xy = (drive.truth.xy - drive.truth.xy[0]) @ np.array([[c, -s], [s, c]])
+    return np.column_stack([xy, drive.truth.yaw - drive.truth.yaw[0]])
+
+
+def onto_truth(drive: Drive, path: Trajectory) -> np.ndarray:
+    """A path's positions [T, 2] aligned to the truth, to be drawn."""
+    return align(path.xy, drive.truth.xy).apply(path.xy)
+
+
+@functools.cache
+def pyplot():
+    """matplotlib without a screen."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
