@@ -56,3 +56,14 @@ def mean_pose(particles: Particles) -> SE2:
     """Weighted mean; of the yaw too, which is not wrapped and so has no jump within the cloud."""
     w = jnp.exp(particles.log_weight)
     return SE2(w @ particles.T_world_robot.xy, w @ particles.T_world_robot.yaw)
+
+
+def pose_covariance(particles: Particles) -> Float[Array, "3 3"]:
+    """Weighted covariance of (x, y, yaw), metres and radians.
+
+    It is that of the pose in the map, which all particles share: what the map is wrong by is not
+    in it.
+    """
+    mean, T = mean_pose(particles), particles.T_world_robot
+    d = jnp.concatenate([T.xy - mean.xy, (T.yaw - mean.yaw)[:, None]], axis=1)
+    return (jnp.exp(particles.log_weight)[:, None] * d).T @ d

@@ -20,7 +20,14 @@ from sofjax.likelihood import (
 )
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions, sample_slip
 from sofjax.observation import Observation
-from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
+from sofjax.particles import (
+    Particles,
+    effective_size,
+    mean_pose,
+    pose_covariance,
+    systematic,
+    winner,
+)
 from sofjax.segment_map import (
     MapRules,
     SegmentMap,
@@ -34,6 +41,7 @@ from sofjax.sof import SofExtraction, extract
 
 SURE = 1.5  # noise up to which the sensor may convict the wheels of a slip
 LOST_AFTER = 10  # images without one known segment
+ACROSS = 0.5  # sine of the angle from the heading beyond which a line runs across the way
 KNOWN = 0.5  # prior probability that a segment on the floor is one of the map; of the soft form
 
 
@@ -83,6 +91,7 @@ class StepInfo(eqx.Module):
     """What one step tells and does not carry."""
 
     T_world_robot: SE2  # the estimate
+    covariance: Float[Array, "*batch 3 3"]  # of the particles' (x, y, yaw): in the map, not of it
     bias: Float[Array, "*batch 4"]  # its odometer's errors
     effective_size: Float[Array, "*batch"]
     log_evidence: Float[Array, "*batch"]  # log of the mean likelihood of the particles
@@ -92,6 +101,7 @@ class StepInfo(eqx.Module):
     below_horizon: Int[Array, "*batch"]  # on the floor's side of the horizon and within range
     associated: Int[Array, "*batch"]  # by eq. (9)
     matched: Int[Array, "*batch"]  # to the map
+    across: Int[Array, "*batch"]  # of them, those that run across the heading and hold the distance
     born: Int[Array, "*batch"]  # new in the map
     map_overflow: Int[Array, "*batch"]  # found no free slot
     lost: Bool[Array, "*batch"]
@@ -220,6 +230,7 @@ def step(
     detected = observation.segments_image.valid
     info = StepInfo(
         T_world_robot=chosen,
+        covariance=pose_covariance(weighted),
         bias=jnp.exp(weighted.log_weight) @ bias.mean,
         effective_size=size,
         log_evidence=log_evidence,
@@ -229,6 +240,7 @@ def step(
         below_horizon=sightings.valid.sum(),
         associated=is_sof.sum(),
         matched=known.sum(),
+        across=(known & (jnp.abs(jnp.sin(sightings.line.theta)) > ACROSS)).sum(),
         born=new.sum() - overflow,
         map_overflow=overflow,
         lost=unmatched >= LOST_AFTER,

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from sofjax import viewer
-from sofjax.cli import main
+from sofjax.cli import main, report
 from sofjax.cli.run import views
+from sofjax.cli.tally import Tally
 from sofjax.io.drive import motions, read_drive
 from sofjax.io.map_file import read_map
 from sofjax.io.trajectory import read_trajectory
@@ -371,3 +372,18 @@ def test_a_cache_that_cannot_be_written_is_refused(tmp_path, monkeypatch, capsys
     monkeypatch.setenv("SOFJAX_CACHE", str(tmp_path / "file"))
     assert main(["run", "drive"]) == 2
     assert "SOFJAX_CACHE" in capsys.readouterr().err
+
+
+def test_where_nothing_seen_holds_the_distance_it_is_said(done):
+    """Twenty metres, a line across the way seen up to the third and again at the twelfth."""
+    drive = read_drive(OFFICE)
+    poses = [np.array([x, 0.0, 0.0]) for x in range(21)]
+    tally = Tally(stamps=list(drive.image_stamps[:21]), poses=poses, across=[0] * 21)
+    tally.across[:4], tally.across[12] = [2, 1, 3, 1], 1
+    assert tally.unheld == pytest.approx(9)
+    (said,) = report.warnings(drive, tally)
+    assert said.startswith("for 9.0 m no line across the way") and "odometer" in said
+    tally.across[7] = tally.across[9] = tally.across[16] = 1
+    assert tally.unheld == pytest.approx(4) and not report.warnings(drive, tally)
+    assert Tally().unheld == 0
+    assert report_of(done)["longest_without_lines_across_m"] < 1.5

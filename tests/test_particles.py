@@ -7,7 +7,14 @@ import pytest
 
 from sofjax.geometry import SE2
 from sofjax.motion import OdometerBias
-from sofjax.particles import Particles, effective_size, mean_pose, systematic, winner
+from sofjax.particles import (
+    Particles,
+    effective_size,
+    mean_pose,
+    pose_covariance,
+    systematic,
+    winner,
+)
 
 KEYS = [jax.random.key(i) for i in range(20)]
 
@@ -114,3 +121,11 @@ def test_the_mean_yaw_keeps_the_turns_of_the_path():
     mean = mean_pose(cloud([[0, 0], [0, 0]], [np.pi - 0.1, np.pi + 0.1], log(1, 1)))
     assert mean.yaw == pytest.approx(np.pi)
     assert mean_pose(cloud([[0, 0]], [9 * np.pi], log(1))).yaw == pytest.approx(9 * np.pi)
+
+
+def test_the_covariance_is_that_of_numpy(rng):
+    xy, yaw, weights = rng.normal(size=(9, 2)), rng.normal(size=9), rng.uniform(0.1, 1, size=9)
+    expected = np.cov(np.column_stack([xy, yaw]).T, aweights=weights, bias=True)
+    found = pose_covariance(cloud(xy, jnp.array(yaw), log(*weights)))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert not pose_covariance(cloud([[3, 4]], [0.1], log(1))).any()

@@ -30,6 +30,7 @@ from sofjax.io.errors import InputError
 from sofjax.io.map_file import write_map
 from sofjax.io.settings import to_dict
 
+UNHELD = 5.0  # metres; R, within which a line across the way is mapped and holds the distance
 PACKAGES = ("sofjax", "jax", "jaxlib", "equinox", "numpy", "opencv-python-headless")
 
 
@@ -162,6 +163,11 @@ def warnings(drive: Drive, tally: Tally) -> list[str]:
             f"the map was full, and {tally.step['map_overflow']} new lines found no place; "
             "segment_map.capacity makes room"
         )
+    if tally.unheld > UNHELD:
+        found.append(
+            f"for {tally.unheld:.1f} m no line across the way was matched to the map: the distance "
+            "driven there is the odometer's alone"
+        )
     return found
 
 
@@ -208,6 +214,7 @@ def write_report(
                 "lost": tally.step["lost"],
                 "unreadable": tally.unreadable,
             },
+            "longest_without_lines_across_m": tally.unheld,
             "loop": {"asked": settings.loop} | (results.closed.report if results.closed else {}),
             "frames_per_second": tally.frames_per_second,
             "milliseconds_per_image": tally.milliseconds(),

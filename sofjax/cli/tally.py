@@ -26,6 +26,7 @@ class Tally:
     poses: list[np.ndarray] = field(default_factory=list)  # (x, y, yaw), metres, radians
     observations: list[Observation] = field(default_factory=list)  # on the host
     tilt: list[np.ndarray] = field(default_factory=list)  # (pitch, roll), radians
+    across: list[int] = field(default_factory=list)  # matched lines that run across the way
     bias: np.ndarray | None = None  # the odometer's errors at last
     unreadable: list[str] = field(default_factory=list)  # files
     blind: int = 0  # images that were read and had no segment
@@ -56,6 +57,7 @@ class Tally:
         self.poses.append(pose)
         self.observations.append(jax.device_get(observed))
         self.tilt.append(info.tilt)
+        self.across.append(int(info.across))
         self.bias = info.bias
         if not view.readable:
             self.unreadable.append(str(drive.image_files[i].relative_to(drive.path)))
@@ -77,6 +79,14 @@ class Tally:
         """The estimates, with a leading axis for the images."""
         poses = np.reshape(self.poses, (-1, 3)).astype(np.float32)
         return SE2(jnp.asarray(poses[:, :2]), jnp.asarray(poses[:, 2]))
+
+    @property
+    def unheld(self) -> float:
+        """The longest way driven without a known line across it, metres."""
+        travelled = self.trajectory.travelled
+        held = np.flatnonzero(self.across)
+        ends = travelled[[0, *held, -1]] if len(travelled) else np.zeros(2)
+        return float(np.diff(ends).max())
 
     @property
     def frames_per_second(self) -> float | None:
