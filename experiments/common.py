@@ -11,17 +11,25 @@ import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import t
 
 from sofjax import PRESETS, slam
-from sofjax.evaluation import align, evaluate_trajectory
+from sofjax.evaluation import evaluate_trajectory
 from sofjax.geometry import SE2, Camera, Mount
 from sofjax.io.trajectory import Trajectory
 from sofjax.observation import Observation
-from sofjax.simulation import Detection, Scene, make_world, observe, random_rig, take_ride
+from sofjax.simulation import (
+    Detection,
+    Scene,
+    World,
+    make_world,
+    observe,
+    random_rig,
+    take_ride,
+)
 
 M = 64  # segments an image
 LSD = Detection()
@@ -115,32 +123,15 @@ def stack(drives: list[Drive]) -> tuple[Camera, Mount, Observation]:
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(a) for a in leaves]), *each)
 
 
-@eqx.filter_jit
-def run_batch(config, camera, mount, observations, keys):
-    """The filter on every drive of a batch, each with its key.
-
-    **Returns:** the infos and the covariances [drives, T, 3, 3] of the particles' (x, y, yaw).
-    """
+@jax.jit
+def run_batch(config, camera, mount, observations, keys) -> slam.StepInfo:
+    """The filter on every drive of a batch, each with its key; infos [drives, T]."""
 
     def one(camera, mount, observations, key):
         state = slam.init(config, camera, mount, key, M)
-
-        def step(state, observation):
-            state, info = slam.step(config, camera, mount, state, observation)
-            return state, (info, spread(state.particles))
-
-        return jax.lax.scan(step, state, observations)[1]
+        return slam.run(config, camera, mount, state, observations)[1]
 
     return jax.vmap(one)(camera, mount, observations, keys)
-
-
-def spread(particles) -> jax.Array:
-    """Covariance [3, 3] of the particles in (x, y, yaw) of the world."""
-    T = particles.T_world_robot
-    poses = jnp.concatenate([T.xy, T.yaw[:, None]], axis=1)
-    w = jnp.exp(particles.log_weight)
-    d = poses - w @ poses
-    return (w[:, None] * d).T @ d
 
 
 def path_of(drive: Drive, poses: SE2) -> Trajectory:
@@ -159,20 +150,37 @@ def odometry_errors(drive: Drive):
     return evaluate_trajectory(drive.truth, drive.odometry)[0]
 
 
+def ratio_of(errors: np.ndarray, others: np.ndarray) -> tuple[float, float, float]:
+    """Geometric mean of the ratios of paired errors, and its 95 % interval by Student's t."""
+    logs = np.log(np.asarray(errors) / np.asarray(others))
+    n = len(logs)
+    half = t.ppf(0.975, n - 1) * logs.std(ddof=1) / n**0.5 if n > 1 else np.inf
+    low, middle, high = np.exp(logs.mean() + half * np.array([-1, 0, 1]))
+    return float(middle), float(low), float(high)
+
+
+FLOORS = {"mark": "blocks", "grout": "tiles", "plank": "planks", "stripe": "stripes"}
+
+
+def floor_of(world: World) -> str:
+    """blocks, tiles, diamonds, planks, stripes or bare."""
+    for kind, floor in FLOORS.items():
+        if kind in world.floor_segments.kinds:
+            d = np.diff(world.floor_lines.endpoints, axis=1)[:, 0]
+            slanted = len(d) and abs(d[0]).min() > 1e-6
+            return "diamonds" if floor == "tiles" and slanted else floor
+    return "bare"
+
+
 def one_of(batch, i: int):
     return jax.tree.map(lambda leaf: leaf[i], batch)
 
 
-def true_in_start(drive: Drive) -> np.ndarray:
-    """True poses [T, 3] in the frame of the first, which is where the filter begins."""
-    c, s = np.cos(drive.truth.yaw[0]), np.sin(drive.truth.yaw[0])
-    xy = (drive.truth.xy - drive.truth.xy[0]) @ np.array([[c, -s], [s, c]])
-    return np.column_stack([xy, drive.truth.yaw - drive.truth.yaw[0]])
-
-
-def onto_truth(drive: Drive, path: Trajectory) -> np.ndarray:
-    """A path's positions [T, 2] aligned to the truth, to be drawn."""
-    return align(path.xy, drive.truth.xy).apply(path.xy)
+def in_start(path: Trajectory) -> np.ndarray:
+    """Poses [T, 3] in the frame of the first, which is where the filter begins."""
+    c, s = np.cos(path.yaw[0]), np.sin(path.yaw[0])
+    xy = (path.xy - path.xy[0]) @ np.array([[c, -s], [s, c]])
+    return np.column_stack([xy, path.yaw - path.yaw[0]])
 
 
 @functools.cache

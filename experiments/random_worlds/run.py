@@ -31,14 +31,17 @@ COLUMNS = (
     "odometry_percent", "map_precision", "map_recall", "matched", "without_segments", "lost",
     "height_m", "pitch_deg", "focal_px", "seconds", "failure",
 )  # fmt: skip
-FLOORS = {"mark": "blocks", "grout": "tiles", "plank": "planks", "stripe": "stripes"}
 
 
 def one(seed: int, folder: Path, few: list[str], settings: list[str]) -> dict[str, object]:
     """Simulate and run one world; `failure` says what went wrong, if anything did."""
     begun = time.perf_counter()
     drive, out = folder / f"world-{seed}", folder / f"run-{seed}"
-    row: dict[str, object] = {"seed": seed, "floor": floor_of(seed), "failure": ""}
+    row: dict[str, object] = {
+        "seed": seed,
+        "floor": common.floor_of(make_world("random", seed)),
+        "failure": "",
+    }
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
@@ -69,16 +72,6 @@ def one(seed: int, folder: Path, few: list[str], settings: list[str]) -> dict[st
             row["failure"] = "not finite"
     row["seconds"] = time.perf_counter() - begun
     return row
-
-
-def floor_of(seed: int) -> str:
-    world = make_world("random", seed)
-    for kind, floor in FLOORS.items():
-        if kind in world.floor_segments.kinds:
-            d = np.diff(world.floor_lines.endpoints, axis=1)[:, 0]
-            slanted = len(d) and abs(d[0]).min() > 1e-6
-            return "diamonds" if floor == "tiles" and slanted else floor
-    return "bare"
 
 
 def camera_of(drive: Path) -> dict[str, float]:

@@ -5,7 +5,7 @@
 One stretch of a drive is run with one size changed at a time; compiling is told apart. The last
 part shares the particles of one filter among processes by jax.distributed, against one process:
 on one machine this shows that the results are the same, not that it is faster, as one process
-uses all cores already. On a cluster, start `--worker RANK --address HOST:PORT` on each machine.
+uses all cores already. On a cluster, start `worker.py` on each machine.
 """
 
 import json
@@ -77,45 +77,15 @@ def draw(table: dict, path: Path) -> None:
     plot.savefig(path, dpi=110)
 
 
-def work(args):
-    import jax
-
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-    if args.processes > 1:
-        jax.distributed.initialize(args.address, args.processes, args.worker)
-
-    from sofjax import slam
-
-    # the same in every process: a drive seen as segments, and the first state
-    drive = common.random_drive("random", args.seed, args.images)
-    camera, mount, log = drive.camera, drive.mount, drive.observations
-    config = common.config_of(filter={"particles": 1024}, segment_map={"capacity": 128})
-    state = slam.init(config, camera, mount, jax.random.key(args.seed), common.M)
-
-    auto = (jax.sharding.AxisType.Auto,)
-    mesh = jax.make_mesh((jax.device_count(),), ("particles",), axis_types=auto)
-    copied = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-    state = slam.distribute(state, mesh)
-    camera, mount, log = jax.jit(lambda a: a, out_shardings=copied)((camera, mount, log))
-    jax.block_until_ready(slam.run(config, camera, mount, state, log))  # compiled
-    begun = time.perf_counter()
-    state, info = jax.block_until_ready(slam.run(config, camera, mount, state, log))
-    seconds = time.perf_counter() - begun
-    if args.worker == 0:
-        held = [shard.data.shape[0] for shard in state.particles.log_weight.addressable_shards]
-        result = {"devices": jax.device_count(), "particles_held": held, "seconds": seconds}
-        result["xy"] = np.asarray(info.T_world_robot.xy, float).tolist()
-        print(json.dumps(result))
-
-
 def start(args, processes):
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    command = [sys.executable, __file__, "--processes", str(processes), "--address", address]
+    command = [sys.executable, str(Path(__file__).with_name("worker.py")), "--address", address]
+    command += ["--processes", str(processes)]
     command += ["--images", str(args.images), "--seed", str(args.seed)]
     workers = [
-        subprocess.Popen([*command, "--worker", str(rank)], stdout=subprocess.PIPE, text=True)
+        subprocess.Popen([*command, "--rank", str(rank)], stdout=subprocess.PIPE, text=True)
         for rank in range(processes)
     ]
     said = [worker.communicate()[0] for worker in workers]
@@ -128,11 +98,7 @@ def main():
     parser = common.options(__doc__, __file__)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--images", type=int, default=20)
-    parser.add_argument("--worker", type=int, metavar="RANK")
-    parser.add_argument("--address", metavar="HOST:PORT")
     args = parser.parse_args()
-    if args.worker is not None:
-        return work(args)
     args.images = 10 if args.quick else args.images
     table = {}
     for name, sizes in (FEW if args.quick else SIZES).items():
