@@ -124,7 +124,7 @@ def test_names_to_free():
 def test_bad_options(refused, tmp_path):
     out = ("-o", tmp_path / "camera.yaml")
     assert "there is no 'tilt'" in refused(OFFICE, "--free", "height,tilt", *out)
-    assert "at least must be free" in refused(OFFICE, "--free", "turn", *out)
+    assert "at least must be free" in refused(OFFICE, "--free", "left", *out)
     assert "leave 'distance' out" in refused(OFFICE, "--free", "pitch,distance", "--joint", *out)
     assert "greater than 0" in refused(OFFICE, "--initial", "height=-1", *out)
     assert "no field 'hight'" in refused(OFFICE, "--initial", "hight=1", *out)

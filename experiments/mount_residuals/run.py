@@ -63,7 +63,7 @@ def polar_fit(camera, mount, pairs, sigma):
     centre = jnp.eye(3).at[:2, 2].set(-camera.K[:2, 2])
 
     def one(by, first, second, T):
-        moved = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(3)])).mount
+        moved = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])).mount
         H = centre @ two_view_homography(camera, moved, T) @ jnp.linalg.inv(centre)
         ends = lambda s: s - camera.K[:2, 2]
         carried = transfer_line(H, line_through(*ends(first)))
@@ -77,7 +77,7 @@ def polar_fit(camera, mount, pairs, sigma):
     by = optx.least_squares(residuals, solver, jnp.zeros(3), max_steps=60, throw=False).value
     J = jax.jacfwd(residuals)(by, None)
     C = jnp.linalg.inv(jnp.einsum("nri,nrj->ij", J, J) + 1e-9 * jnp.eye(3))
-    m = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(3)])).mount
+    m = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])).mount
     unit = jnp.stack([m.height, jnp.ones(()), jnp.ones(())])
     return jnp.stack([m.height, m.pitch, m.roll]), C * jnp.outer(unit, unit)
 
@@ -93,7 +93,7 @@ def bound(camera, mount, pairs):
 
     def one(first, second, T):
         of = lambda by, a, b: distances(
-            camera, start_at(mount).moved(jnp.concatenate([by, jnp.zeros(3)])), a, b, T
+            camera, start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])), a, b, T
         )[:2]
         J, a, b = jax.jacfwd(of, (0, 1, 2))(jnp.zeros(3), first, second)
         noise = jnp.concatenate([a.reshape(2, 4), b.reshape(2, 4)], axis=1)

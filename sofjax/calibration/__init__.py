@@ -3,6 +3,7 @@
 from sofjax.calibration.fit import CalibrationResult as CalibrationResult
 from sofjax.calibration.fit import FitRules as FitRules
 from sofjax.calibration.fit import fit_mount as fit_mount
+from sofjax.calibration.pairs import TURNS as TURNS
 from sofjax.calibration.pairs import UNKNOWNS as UNKNOWNS
 from sofjax.calibration.pairs import PairNoise as PairNoise
 from sofjax.calibration.pairs import Pairs as Pairs

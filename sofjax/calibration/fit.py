@@ -24,10 +24,11 @@ class FitRules(eqx.Module):
     """What is free, what is known beforehand, and when an answer is one."""
 
     free: tuple[str, ...] = eqx.field(static=True, default=MOUNT)  # of UNKNOWNS
-    # standard deviations: log height, pitch, roll, yaw in radians, log distance, log turn
-    prior_sigma: tuple[float, ...] = (3.0, 1.0, 1.0, 1.0, 0.02, 0.05)
+    # standard deviations: log height; pitch, roll, yaw in radians; the odometer's errors
+    prior_sigma: tuple[float, ...] = (3.0, 1.0, 1.0, 1.0, 0.02, 0.05, 0.05, 0.005)
     loss_scale: float = 2.0  # residuals, in sigmas, from which they count linearly only
-    limit: tuple[float, ...] = (0.05, 0.02, 0.02, 0.02, 0.05, 0.1)  # sigma of an answer at most
+    # of an answer at most
+    limit: tuple[float, ...] = (0.05, 0.02, 0.02, 0.02, 0.05, 0.1, 0.1, 0.01)
     pixel_sigma: float = 0.5  # noise of the end points that what seems to be known is held against
     min_pairs: int = 20
 
@@ -39,11 +40,11 @@ class CalibrationResult(eqx.Module):
     """A fitted mount, and how sure it is."""
 
     mount: Mount
-    odometer: Float[Array, "2"]  # true / read, of distance and of turning; 1 where not free
-    covariance: Float[Array, "6 6"]  # of UNKNOWNS, in metres, radians and shares; 0 if not free
+    odometer: Float[Array, "4"]  # its systematic errors b, see `MotionModel`; 0 where not free
+    covariance: Float[Array, "8 8"]  # of UNKNOWNS, in metres, radians and shares; 0 if not free
     residuals: Float[Array, "N 4"]  # pixels; 0 where a pair is not valid
-    observable: Bool[Array, "6"]  # whether each of UNKNOWNS was free and the pairs fix it
-    blind: Float[Array, "6"]  # the direction that is known least, in shares of `limit`, a unit ...
+    observable: Bool[Array, "8"]  # whether each of UNKNOWNS was free and the pairs fix it
+    blind: Float[Array, "8"]  # the direction that is known least, in shares of `limit`, a unit ...
     blindness: Float[Array, ""]  # ... and its standard deviation in the same; > 1 is no answer
     cost: Float[Array, ""]  # half the sum of robust squares, in sigmas
     result: optx.RESULTS  # of the solver; an estimate that did not converge is the best so far
@@ -104,7 +105,7 @@ def _fit(
     r, known = with_priors(by, None)
     return CalibrationResult(
         mount=estimate.mount,
-        odometer=jnp.stack([estimate.distance, estimate.turn]),
+        odometer=estimate.bias,
         covariance=covariance * jnp.outer(unit, unit),
         residuals=jnp.where(pairs.valid[:, None], all_distances(camera, estimate, pairs), 0),
         observable=is_free & sure & enough,
@@ -115,7 +116,7 @@ def _fit(
     )
 
 
-def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "6 6"]:
+def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "8 8"]:
     """Covariance of the estimate from how the clusters disagree: A^-1 (Σ g gᵀ) A^-1.
 
     Errors of pairs that share images, a line or an odometer's reading are correlated, and the
@@ -185,6 +186,6 @@ _WHY = (
 
 
 def _amount(name: str, sigma: float) -> str:
-    if name in ("height", "distance", "turn"):
+    if name in ("height", "distance", "left", "right"):
         return f"known to {100 * sigma:.2g} %"
     return f"known to {sigma * 57.29578:.2g}°"

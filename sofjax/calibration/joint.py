@@ -32,7 +32,7 @@ def fit_jointly(
     - `mount`: nearly right, as `fit_drive` finds it.
     - `free`: of height, pitch, roll and yaw.
     """
-    rules = rules or SmoothingRules()
+    rules = rules or SmoothingRules(rounds=1)  # more of them change nothing of the mount
     config = eqx.tree_at(lambda c: c.motion.distance_scale_sigma, config, 0.0)
     unit = (float(mount.height), 1.0, 1.0, 1.0)
     sigma = tuple(

@@ -11,8 +11,9 @@ from sofjax.geometry.se2 import SE2
 from sofjax.geometry.two_view import two_view_homography
 from sofjax.motion import MotionModel
 
-UNKNOWNS = ("height", "pitch", "roll", "yaw", "distance", "turn")
+UNKNOWNS = ("height", "pitch", "roll", "yaw", "distance", "left", "right", "curvature")
 U = len(UNKNOWNS)
+TURNS = UNKNOWNS[5:]  # an odometer errs in these more than in anything: free with any mount
 
 
 class Pairs(eqx.Module):
@@ -27,30 +28,32 @@ class Pairs(eqx.Module):
 
 
 class Estimate(eqx.Module):
-    """A mount, and by what the odometer's readings are to be multiplied."""
+    """A mount, and the odometer's systematic errors b, those of `MotionModel`."""
 
     mount: Mount
-    distance: Float[Array, ""]  # true / read
-    turn: Float[Array, ""]  # true / read
+    bias: Float[Array, "4"]  # of distance, of left and of right turns, shares; radians per metre
 
-    @property
-    def scale(self) -> Float[Array, "3"]:
-        """What the odometer's (forward, sideways, turn) is to be multiplied by."""
-        return jnp.stack([self.distance, self.distance, self.turn])
-
-    def moved(self, by: Float[Array, "6"]) -> "Estimate":
-        """Changed by log height, pitch, roll, yaw, log distance, log turn."""
+    def moved(self, by: Float[Array, "8"]) -> "Estimate":
+        """Changed by log height, pitch, roll, yaw, and b."""
         m = self.mount
         mount = Mount(
             m.x, m.y, m.height * jnp.exp(by[0]), m.pitch + by[1], m.roll + by[2], m.yaw + by[3]
         )
-        return Estimate(mount, self.distance * jnp.exp(by[4]), self.turn * jnp.exp(by[5]))
+        return Estimate(mount, self.bias + by[4:])
+
+    def motion(self, read: SE2) -> SE2:
+        """What the robot did where the odometer read this, a short motion."""
+        forward, sideways, turn = read.log()
+        b = self.bias
+        scaled = turn + jnp.maximum(turn, 0) * b[1] + jnp.minimum(turn, 0) * b[2]
+        return SE2.exp(
+            jnp.stack([forward * (1 + b[0]), sideways, scaled + jnp.abs(forward) * b[3]])
+        )
 
 
 def start_at(mount: Mount) -> Estimate:
     """A mount, and an odometer that is right."""
-    one = jnp.ones_like(mount.height)
-    return Estimate(mount, one, one)
+    return Estimate(mount, jnp.zeros(4, jnp.result_type(mount.height)))
 
 
 def distances(
@@ -67,8 +70,7 @@ def distances(
 
     **Returns:** pixels, signed; zero for a line of the floor if the mount is right.
     """
-    T = SE2.exp(T_first_second.log() * estimate.scale)
-    H = two_view_homography(camera, estimate.mount, T)  # eq. (8)
+    H = two_view_homography(camera, estimate.mount, estimate.motion(T_first_second))  # eq. (8)
     l_second = cofactor(H) @ line_through(*first)
     l_first = H.T @ line_through(*second)
     to = jax.vmap(line_point_distance, in_axes=(None, 0))

@@ -9,9 +9,10 @@ from jaxtyping import Array, Float, Int
 
 from sofjax.calibration.fit import CalibrationResult, FitRules, fit_mount, verdict
 from sofjax.calibration.heights import FloorRules, on_floor
-from sofjax.calibration.pairs import Estimate, PairNoise, Pairs, U, expected, start_at
+from sofjax.calibration.pairs import TURNS, Estimate, PairNoise, Pairs, U, expected, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
 from sofjax.geometry.camera import Camera, Mount
+from sofjax.motion import MotionModel
 from sofjax.observation import Observation
 
 # height times, and radians of pitch more: where else to begin
@@ -20,15 +21,20 @@ SEARCH, REFINE = 3, 2  # rounds from each start, and from the place where most o
 FREELY = 2  # rounds before lines are told by their height
 
 
+def random_only() -> PairNoise:
+    """The odometer's systematic errors in turning are solved for: what is left is noise."""
+    return PairNoise(odometer=MotionModel(turn_scale_sigma=0.0, curvature_sigma=0.0))
+
+
 @dataclass(frozen=True)
 class DriveRules:
     """All settings of `fit_drive`."""
 
     track: TrackRules = field(default_factory=TrackRules)
-    noise: PairNoise = field(default_factory=PairNoise)
+    noise: PairNoise = field(default_factory=random_only)
     floor: FloorRules = field(default_factory=FloorRules)
     fit: FitRules = field(
-        default_factory=lambda: FitRules(free=("height", "pitch", "roll", "turn"))
+        default_factory=lambda: FitRules(free=("height", "pitch", "roll", *TURNS))
     )
     capacity: int = 4096  # pairs
     same_height: float = 0.03  # share of the height by which two ends are one place
@@ -47,9 +53,9 @@ class DriveFit:
     agreeing: int  # how many of them ended in the same place
 
     @property
-    def covariance(self) -> Float[np.ndarray, "6 6"]:
+    def covariance(self) -> Float[np.ndarray, "8 8"]:
         """That of the fit, and where the starts ended besides."""
-        spread = np.zeros((6, 6))
+        spread = np.zeros((U, U))
         spread[:3, :3] = np.cov(self.ends.T)
         return np.asarray(self.fit.covariance) + spread
 
@@ -121,5 +127,5 @@ def _rounds(
             floor = on_floor(rules.floor, camera, estimate, pairs, line)
             pairs = eqx.tree_at(lambda p: p.valid, pairs, floor)
         fit = fit_mount(camera, estimate.mount, pairs, rules.fit)
-        estimate = Estimate(fit.mount, fit.odometer[0], fit.odometer[1])
+        estimate = Estimate(fit.mount, fit.odometer)
     return DriveFit(fit, pairs, line, related, np.zeros((0, 3)), 0)

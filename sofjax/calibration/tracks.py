@@ -60,7 +60,7 @@ def follow(
 @eqx.filter_jit
 def _partners(rules: TrackRules, camera: Camera, estimate: Estimate, log: Observation):
     """[T, M] for each lag: the segment so many images before that is the same line, or -1."""
-    poses = path(log.motion, estimate.scale)
+    poses = path(jax.vmap(estimate.motion)(log.motion))
     floor = jax.vmap(below_horizon, in_axes=(None, None, 0))(
         camera, estimate.mount, log.segments_image
     )
@@ -100,15 +100,14 @@ def miss(
 
 
 @jax.jit
-def path(motion: SE2, scale: Float[Array, "3"]) -> SE2:
-    """Poses [T] by the odometer alone, its (forward, sideways, turn) times `scale`."""
-    steps = SE2.exp(motion.log() * scale[None])
+def path(motion: SE2) -> SE2:
+    """Poses [T] after motions [T], the first of which does not count."""
 
     def step(T, moved):
         T = T @ moved
         return T, T
 
-    return jax.lax.scan(step, jax.tree.map(lambda x: jnp.zeros_like(x[0]), steps), steps)[1]
+    return jax.lax.scan(step, jax.tree.map(lambda x: jnp.zeros_like(x[0]), motion), motion)[1]
 
 
 def relate(
@@ -132,7 +131,7 @@ def relate(
     of each pair's line, from 0 to N - 1, and -1 where there is none.
     """
     endpoints = np.asarray(log.segments_image.endpoints, float)
-    poses = jax.device_get(path(log.motion, jnp.ones(3)))
+    poses = jax.device_get(path(log.motion))
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses.xy, axis=0), axis=1))])
     way /= height
     t, m = np.nonzero(track >= 0)

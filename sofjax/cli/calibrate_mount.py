@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 REFUSED = 3  # exit code: all was read, and nothing can be known from it
 # calibration.UNKNOWNS, which would take the parser a second to import
-FREE = ("height", "pitch", "roll", "yaw", "distance", "turn")
+FREE = ("height", "pitch", "roll", "yaw", "distance", "left", "right", "curvature")
 BY_DEFAULT = "height,pitch,roll"
 
 
@@ -42,7 +42,8 @@ def add_parser(parts: argparse._SubParsersAction) -> None:
         "--free",
         metavar="height,pitch,...",
         default=BY_DEFAULT,
-        help=f"what to fit, of {', '.join(FREE)} (the odometer's scales); default {BY_DEFAULT}",
+        help=f"what to fit, of {', '.join(FREE)} (the last four are "
+        f"the odometer's errors, and those in turning are always free); default {BY_DEFAULT}",
     )
     parser.add_argument(
         "--joint",
@@ -158,7 +159,7 @@ def calibrate(
     import jax.numpy as jnp
     import numpy as np
 
-    from sofjax.calibration import DriveRules, FitRules, fit_drive
+    from sofjax.calibration import TURNS, DriveRules, FitRules, fit_drive
     from sofjax.calibration.report import SCALE, estimates
     from sofjax.vision import Frontend
 
@@ -172,7 +173,7 @@ def calibrate(
         )
     log = observed(drive, Frontend(drive.camera_file, settings))
     # the odometer's turning errs more than anything; its distance is the measure of the height
-    rules = DriveRules(fit=FitRules(free=tuple(dict.fromkeys([*free, "turn"]))))
+    rules = DriveRules(fit=FitRules(free=tuple(dict.fromkeys([*free, *TURNS]))))
     with jax.enable_x64(True):
         double = lambda leaf: jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
         camera, mount, log = jax.tree.map(
@@ -241,7 +242,7 @@ def _jointly(camera, found: "DriveFit", log: "Observation", free: tuple[str, ...
     pairs = jax.device_get(found.fit.mount)
     mount = fit_jointly(PRESETS["default"], camera, found.fit.mount, log, free)
     mount = jax.device_get(mount.mount)
-    apart = np.array([getattr(mount, k) - getattr(pairs, k) for k in FREE[:4]] + [0.0, 0.0])
+    apart = np.array([getattr(mount, k) - getattr(pairs, k) for k in FREE[:4]] + [0.0] * 4)
     # residuals of one line, one image, one odometer are not independent: the joint solve's own
     # covariance is too narrow by far
     return mount, found.covariance + np.outer(apart, apart)

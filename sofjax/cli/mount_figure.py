@@ -42,7 +42,7 @@ def _residuals(drive: "Drive", found: "Calibration"):
             for file in files
         ]
         return [
-            np.asarray(all_distances(camera, Estimate(mount, *found.fit.fit.odometer),
+            np.asarray(all_distances(camera, Estimate(mount, found.fit.fit.odometer),
                                      found.fit.pairs))
             for camera, mount in cameras
         ]  # fmt: skip
