@@ -123,6 +123,9 @@ def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "
     inverse information alone is too small by much. `g` is each cluster's gradient at the estimate,
     as it would be without that cluster's own pull on it (the jackknife).
 
+    Few clusters may agree by chance: no direction is known better than by independent pairs that
+    miss each other as these do.
+
     Noise turns segments that tell nothing into some that seem to tell a little, and if all there
     is is noise then that adds up: what jittered segments would tell is not counted in A.
     """
@@ -146,9 +149,12 @@ def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "
     told = jnp.einsum("nri,nrj->ij", told, told)
     from_left = lambda M: jax.scipy.linalg.solve_triangular(L, M, lower=True)
     share, axes = jnp.linalg.eigh(from_left(from_left(told).T))
-    root = from_left(jnp.eye(U)).T @ axes / (1 - jnp.clip(share, 0, 0.99))
-    P = root @ axes.T @ from_left(jnp.eye(U))
-    return P @ middle @ P.T
+    P = axes / (1 - jnp.clip(share, 0, 0.99)) @ axes.T
+    values, axes = jnp.linalg.eigh(P @ from_left(from_left(middle).T) @ P.T)
+    count = 2 * jnp.sum(pairs.valid.astype(r.dtype))
+    independent = jnp.sum(r**2) / jnp.maximum(count, 1)
+    root = from_left(jnp.eye(U)).T @ axes
+    return root * jnp.maximum(values, independent) @ root.T
 
 
 def _blindness(limit, covariance):

@@ -15,7 +15,7 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.motion import MotionModel
 from sofjax.observation import Observation
 
-# height times, and radians of pitch more: where else to begin
+# where to begin: at the mount given, and far from it
 STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
 SEARCH, REFINE = 3, 2  # rounds from each start, and from the place where most of them end
 FREELY = 2  # rounds before lines are told by their height
@@ -36,6 +36,7 @@ class DriveRules:
     fit: FitRules = field(
         default_factory=lambda: FitRules(free=("height", "pitch", "roll", *TURNS))
     )
+    starts: tuple[tuple[float, float], ...] = STARTS  # height times, radians of pitch more
     capacity: int = 4096  # pairs
     same_height: float = 0.03  # share of the height by which two ends are one place
     same_angle: float = 0.01  # radians
@@ -56,7 +57,7 @@ class DriveFit:
     def covariance(self) -> Float[np.ndarray, "8 8"]:
         """That of the fit, and where the starts ended besides."""
         spread = np.zeros((U, U))
-        spread[:3, :3] = np.cov(self.ends.T)
+        spread[:3, :3] = np.cov(self.ends.T, bias=True)
         return np.asarray(self.fit.covariance) + spread
 
     def verdict(self, rules: "DriveRules") -> tuple[bool, str]:
@@ -101,7 +102,7 @@ def starts(mount: Mount, rules: DriveRules) -> list[Mount]:
     """The mount, and others with what is free far from it."""
     free = rules.fit.free
     there = []
-    for times, more in STARTS:
+    for times, more in rules.starts:
         by = jnp.zeros(U).at[0].set(jnp.log(times) if "height" in free else 0.0)
         there.append(start_at(mount).moved(by.at[1].set(more if "pitch" in free else 0.0)).mount)
     return there
