@@ -60,7 +60,7 @@ def test_the_sample_s_mount_is_found_from_far_off(tmp_path, capfd):
     mount = read_camera(out).mount  # the odometer reads 0.99 of the distance
     assert float(mount.height) == pytest.approx(0.594, rel=0.015)
     assert float(mount.pitch) == pytest.approx(TILT, abs=math.radians(0.2))
-    assert abs(float(mount.roll)) < math.radians(0.3)
+    assert abs(float(mount.roll)) < math.radians(0.1)  # its right turns read 7 % too much
     assert float(mount.x) == pytest.approx(0.05) and float(mount.yaw) == 0
     said = capfd.readouterr().out
     for word in (

@@ -17,8 +17,8 @@ from sofjax.observation import Observation
 
 # where to begin: at the mount given, and far from it
 STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
-SEARCH, REFINE = 3, 2  # rounds from each start, and from the place where most of them end
-FREELY = 2  # rounds before lines are told by their height
+SEARCH, REFINE = 10, 3  # rounds from each start at most, and from where most of them end
+SETTLED = 0.1  # of what is one place: a round that moves by less is the last of a search
 
 
 def random_only() -> PairNoise:
@@ -54,6 +54,10 @@ class DriveFit:
     agreeing: int  # how many of them ended in the same place
 
     @property
+    def estimate(self) -> Estimate:
+        return Estimate(self.fit.mount, self.fit.odometer)
+
+    @property
     def covariance(self) -> Float[np.ndarray, "8 8"]:
         """That of the fit, and where the starts ended besides."""
         spread = np.zeros((U, U))
@@ -82,19 +86,21 @@ def fit_drive(
     """The mount of one drive; wants float64.
 
     Associations stay as they are in a solve and are made anew between two. The rounds begin at
-    the given mount and at four others far from it; the answer is where most of them end.
+    the given mount and at four others far from it; the answer is where most of them end. Only
+    from there lines are told by their height: by a wrong mount it is the wrong ones that seem to
+    lie on the floor, and that mount would stay.
 
     **Arguments:**
     - `mount`: roughly.
     """
     rules = rules or DriveRules()
-    searched = [_rounds(camera, start, log, rules, SEARCH, 0) for start in starts(mount, rules)]
+    searched = [_search(camera, start, log, rules) for start in starts(mount, rules)]
     ends = np.array([_place(found.fit.mount) for found in searched])
-    same = np.abs(ends[:, None] - ends) < [rules.same_height * np.median(ends[:, 0]),
-                                           rules.same_angle, rules.same_angle]  # fmt: skip
-    agreeing = same.all(-1).sum(1)
+    agreeing = (_apart(ends[:, None], ends, rules) < 1).all(-1).sum(1)
     best = int(np.lexsort((-np.array([f.pairs.valid.sum() for f in searched]), -agreeing))[0])
-    found = _rounds(camera, searched[best].fit.mount, log, rules, REFINE, FREELY)
+    found = searched[best]
+    for _ in range(REFINE):
+        found = _round(camera, found.estimate, log, rules, tell_floor=True)
     return DriveFit(found.fit, found.pairs, found.line, found.related, ends, int(agreeing[best]))
 
 
@@ -112,21 +118,34 @@ def _place(mount: Mount) -> Float[np.ndarray, "3"]:
     return np.array([mount.height, mount.pitch, mount.roll], float)
 
 
-def _rounds(
-    camera: Camera, mount: Mount, log: Observation, rules: DriveRules, rounds: int, begin: int
+def _apart(a, b, rules: DriveRules) -> Float[np.ndarray, "... 3"]:
+    """How far two places are apart, in shares of what is one place."""
+    return np.abs(a - b) / [rules.same_height * np.median(b[..., 0]), *[rules.same_angle] * 2]
+
+
+def _search(camera: Camera, mount: Mount, log: Observation, rules: DriveRules) -> DriveFit:
+    """Rounds until one hardly moves the mount."""
+    found = _round(camera, start_at(mount), log, rules, tell_floor=False)
+    for _ in range(SEARCH - 1):
+        before = _place(found.fit.mount)
+        found = _round(camera, found.estimate, log, rules, tell_floor=False)
+        if (_apart(before, _place(found.fit.mount), rules) < SETTLED).all():
+            break
+    return found
+
+
+def _round(
+    camera: Camera, estimate: Estimate, log: Observation, rules: DriveRules, tell_floor: bool
 ) -> DriveFit:
-    """Some rounds, counted from `begin`."""
-    estimate = start_at(mount)
-    for count in range(begin, begin + rounds):
-        track = follow(rules.track, camera, estimate, log)
-        height = float(estimate.mount.height)
-        pairs, line = relate(rules.track, log, track, height, rules.capacity)
-        sigma = expected(rules.noise, camera, estimate, pairs)
-        pairs = eqx.tree_at(lambda p: p.sigma, pairs, sigma)
-        related = int(pairs.valid.sum())
-        if count >= FREELY:
-            floor = on_floor(rules.floor, camera, estimate, pairs, line)
-            pairs = eqx.tree_at(lambda p: p.valid, pairs, floor)
-        fit = fit_mount(camera, estimate.mount, pairs, rules.fit)
-        estimate = Estimate(fit.mount, fit.odometer)
+    """Follow, relate and fit, once."""
+    # as the odometer read: what is followed by an error of it would prove that error
+    track = follow(rules.track, camera, start_at(estimate.mount), log)
+    pairs, line = relate(rules.track, log, track, float(estimate.mount.height), rules.capacity)
+    sigma = expected(rules.noise, camera, estimate, pairs)
+    pairs = eqx.tree_at(lambda p: p.sigma, pairs, sigma)
+    related = int(pairs.valid.sum())
+    if tell_floor:
+        floor = on_floor(rules.floor, camera, estimate, pairs, line)
+        pairs = eqx.tree_at(lambda p: p.valid, pairs, floor)
+    fit = fit_mount(camera, estimate.mount, pairs, rules.fit)
     return DriveFit(fit, pairs, line, related, np.zeros((0, 3)), 0)
