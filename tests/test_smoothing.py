@@ -1,4 +1,4 @@
-"""The smoother's arrow shape against dense algebra, and its solution against a known world."""
+"""The smoother's pieces against dense algebra, and its solution against a known world."""
 
 import equinox as eqx
 import jax
@@ -11,11 +11,14 @@ import pytest
 from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floor_to_image
 from sofjax.motion import MotionModel
 from sofjax.smoothing import Keyframes, Priors, Problem, Unknowns, residuals, solve
-from sofjax.smoothing.arrow import assemble
+from sofjax.smoothing.blocks import Jacobian
+from sofjax.smoothing.marginals import marginals
+from sofjax.smoothing.pieces import cut, reduce
 
 pytestmark = pytest.mark.slow  # compiles in double precision, minutes on a busy machine
 
 N, K = 6, 7
+PIECES = lambda problem: cut(problem.keyframes, K, length=3)
 
 
 @pytest.fixture(scope="module")
@@ -73,51 +76,105 @@ def _dense(problem, unknowns):
     return np.asarray(J.T @ J)
 
 
+def _dense_of(blocks, keyframes):
+    """The whole matrix, block by block."""
+    P, L = 5 * N, 3 * K
+    A = np.zeros((P + L + 8, P + L + 8))
+    for i in range(N):
+        at = slice(5 * i, 5 * i + 5)
+        A[at, at] = blocks.pose[i]
+        A[at, P + L :] = blocks.pose_shared[i]
+        if i + 1 < N:
+            A[at, 5 * i + 5 : 5 * i + 10] = blocks.next[i]
+        for m in np.flatnonzero(keyframes.known[i]):
+            k = P + 3 * int(keyframes.line[i, m])
+            A[at, k : k + 3] += blocks.seen[i, m]
+    for k in range(K):
+        at = slice(P + 3 * k, P + 3 * k + 3)
+        A[at, at] = blocks.line[k]
+        A[at, P + L :] = blocks.line_shared[k]
+    A[P + L :, P + L :] = blocks.shared
+    return np.triu(A) + np.triu(A, 1).T
+
+
 def test_assembled_blocks_are_those_of_the_dense_normal_equations(problem):
     problem, _ = problem
     with jax.enable_x64(True):
         u = problem.start
         _, jvp = jax.linearize(lambda v: residuals(v, problem), u)
-        arrow = assemble(jvp, problem.keyframes, u, 0.25)
+        got = _dense_of(Jacobian.of(jvp, u).blocks(problem.keyframes, 0.25), problem.keyframes)
         dense = _dense(problem, u) + 0.25 * np.eye(5 * N + 3 * K + 8)
-        P = 5 * N
-        band = np.zeros((P, P))
-        for i in range(N):
-            band[5 * i : 5 * i + 5, 5 * i : 5 * i + 5] = arrow.diagonal[i]
-            if i + 1 < N:
-                band[5 * i : 5 * i + 5, 5 * i + 5 : 5 * i + 10] = arrow.upper[i]
-                band[5 * i + 5 : 5 * i + 10, 5 * i : 5 * i + 5] = arrow.upper[i].T
         scale = np.sqrt(np.outer(np.diag(dense), np.diag(dense)))
-        np.testing.assert_allclose(band / scale[:P, :P], dense[:P, :P] / scale[:P, :P], atol=1e-12)
-        border = np.asarray(arrow.border).reshape(P, -1)
-        np.testing.assert_allclose(
-            border / scale[:P, P:], dense[:P, P:] / scale[:P, P:], atol=1e-12
-        )
-        corner = np.asarray(arrow.corner)
-        np.testing.assert_allclose(
-            corner / scale[P:, P:], dense[P:, P:] / scale[P:, P:], atol=1e-12
-        )
+        np.testing.assert_allclose(got / scale, dense / scale, atol=1e-12)
 
 
-def test_a_step_of_the_arrow_solves_the_dense_equations(problem):
+def test_the_jacobian_transposed_is_the_gradient_of_half_the_squares(problem):
     problem, _ = problem
     with jax.enable_x64(True):
+        half = lambda u: 0.5 * sum((r**2).sum() for r in jax.tree.leaves(residuals(u, problem)))
+        want = jax.grad(half)(problem.start)
+        r, jvp = jax.linearize(lambda v: residuals(v, problem), problem.start)
+        got, sighted = Jacobian.of(jvp, problem.start).transposed(problem.keyframes, r)
+        for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+        seen = lambda u: 0.5 * (residuals(u, problem).pixels ** 2).sum()
+        want = jax.grad(seen)(problem.start).line
+        np.testing.assert_allclose(sighted, want, rtol=1e-9, atol=1e-9 * np.abs(want).max())
+
+
+def test_pieces_have_the_lines_for_themselves_that_no_other_sees(problem):
+    problem, _ = problem
+    frames = problem.keyframes
+    known = jnp.zeros((N, K), bool).at[0, 1].set(True).at[1, 4].set(True).at[4, 4].set(True)
+    frames = eqx.tree_at(lambda f: f.known, frames, known.at[5, 6].set(True))
+    pieces = cut(frames, K, length=3)
+    own = [sorted(int(k) for k in row if k < K) for row in pieces.own]
+    assert 1 in own[0]
+    assert 6 in own[1]
+    assert sorted(own[0] + own[1]) == [0, 1, 2, 3, 5, 6]
+    assert [int(k) for k in pieces.left if k < K] == [4]
+    P = pieces.own.shape[1]
+    assert pieces.slot[1, 4] == pieces.slot[4, 4] == P  # the first of those left over, for both
+    assert pieces.own[0, pieces.slot[0, 1]] == 1
+    assert (np.asarray(pieces.slot)[~known] <= P + pieces.border.shape[1]).all()
+
+
+@pytest.mark.parametrize("length", [2, 3, 6])
+def test_a_step_by_pieces_solves_the_dense_equations(problem, length):
+    problem, _ = problem
+    with jax.enable_x64(True):
+        # the first lines are seen by all, the next by the first half, the last by the second
+        known = problem.keyframes.known.at[3:, 3:5].set(False).at[:3, 5:].set(False)
+        problem = eqx.tree_at(lambda p: p.keyframes.known, problem, known)
         u = problem.start
         _, jvp = jax.linearize(lambda v: residuals(v, problem), u)
-        arrow = assemble(jvp, problem.keyframes, u, 1.0)
+        blocks = Jacobian.of(jvp, u).blocks(problem.keyframes, 1.0)
+        pieces = cut(problem.keyframes, K, length)
+        reduced = jax.jit(reduce)(blocks, pieces)
         rng = np.random.default_rng(1)
-        pose, rest = rng.normal(size=(N, 5)), rng.normal(size=3 * K + 8)
-        x, y = arrow.solve(jnp.asarray(pose), jnp.asarray(rest))
+        right = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), u)
+        got, _ = jax.flatten_util.ravel_pytree(reduced.solve(right))
         dense = _dense(problem, u) + np.eye(5 * N + 3 * K + 8)
-        want = np.linalg.solve(dense, np.concatenate([pose.ravel(), rest]))
-        got = np.concatenate([np.ravel(x), y])
+        want = np.linalg.solve(dense, jax.flatten_util.ravel_pytree(right)[0])
         np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
+
+        inverse = np.linalg.inv(dense)
+        found = jax.jit(marginals)(reduced)
+        P = 5 * N
+        for i in range(N):
+            at = slice(5 * i, 5 * i + 5)
+            np.testing.assert_allclose(found.pose[i], inverse[at, at], rtol=1e-6, atol=1e-12)
+        i, j = (v.ravel() for v in np.mgrid[:K, :K])
+        pairs = found.of_lines(jnp.asarray(i), jnp.asarray(j), K)
+        want = inverse[P : P + 3 * K, P : P + 3 * K].reshape(K, 3, K, 3)[i, :, j, :]
+        np.testing.assert_allclose(pairs, want, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(found.shared, inverse[-8:, -8:], rtol=1e-6, atol=1e-12)
 
 
 def test_solution_is_that_of_a_dense_solver_and_finds_the_path(problem):
     problem, pose = problem
     with jax.enable_x64(True):
-        ours = solve(problem)
+        ours = solve(problem, PIECES(problem))
         assert bool(ours.converged)
         np.testing.assert_allclose(ours.unknowns.pose[:, :3], pose[:, :3], atol=5e-3)
         solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
@@ -129,14 +186,17 @@ def test_solution_is_that_of_a_dense_solver_and_finds_the_path(problem):
 def test_marginal_covariances_are_those_of_the_dense_inverse(problem):
     problem, _ = problem
     with jax.enable_x64(True):
-        ours = solve(problem)
+        ours = solve(problem, PIECES(problem))
         scale = np.linalg.inv(_dense(problem, ours.unknowns))
         for i in range(N):
             want = scale[5 * i : 5 * i + 5, 5 * i : 5 * i + 5]
             np.testing.assert_allclose(ours.pose_covariance[i], want, rtol=1e-4, atol=1e-12)
-        k = 5 * N + 3 * 2
+        k, two = 5 * N + 3 * 2, jnp.array([2])
         np.testing.assert_allclose(
-            ours.line_covariance[2], scale[k : k + 3, k : k + 3], rtol=1e-4, atol=1e-12
+            ours.marginals.of_lines(two, two, K)[0],
+            scale[k : k + 3, k : k + 3],
+            rtol=1e-4,
+            atol=1e-12,
         )
 
 
@@ -144,6 +204,6 @@ def test_a_drive_without_one_known_segment_follows_the_odometer(problem):
     problem, pose = problem
     with jax.enable_x64(True):
         blind = eqx.tree_at(lambda p: p.keyframes.known, problem, jnp.zeros((N, K), bool))
-        found = solve(blind)
+        found = solve(blind, PIECES(blind))
         assert bool(jnp.isfinite(found.unknowns.pose).all())
         np.testing.assert_allclose(found.unknowns.pose[:, :3], pose[:, :3] + 0, atol=1e-3)

@@ -14,7 +14,9 @@ from sofjax.slam import SlamConfig
 from sofjax.smoothing import Path, Seeing, SmoothingRules, Unknowns, smooth
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.lines import associate, lines_of
+from sofjax.smoothing.marginals import Marginals
 from sofjax.smoothing.merging import doubles, representatives
+from sofjax.smoothing.pieces import Pieces
 
 
 def straight(n, step=0.1):
@@ -123,9 +125,18 @@ def test_lines_are_one_where_what_is_known_of_both_together_allows_it(
     joint = joint.at[1, :, 1, :].set(sigma @ sigma)
     if together:  # the same error in both: their difference is known well
         joint = jnp.broadcast_to((sigma @ sigma)[None, :, None, :], (2, 3, 2, 3))
-    into, joins = doubles(lines, joint, jnp.array([9, 4]))
+    into, joins = doubles(lines, known(joint), jnp.array([9, 4]))
     assert joins.tolist() == [False, is_one]
     assert not is_one or into[1] == 0
+
+
+def known(joint):
+    """Marginals of two lines that are left over between pieces that see nothing else."""
+    pieces = Pieces(jnp.full((1, 1), 2), jnp.arange(2), jnp.arange(2)[None], jnp.zeros((2, 1), int))
+    rest = jnp.zeros((19, 19)).at[5:11, 5:11].set(joint.reshape(6, 6))
+    return Marginals(
+        pieces, rest, jnp.zeros((1, 1, 3, 24)), jnp.zeros((1, 1, 3, 1, 3)), jnp.zeros((2, 5, 5))
+    )
 
 
 def test_names_are_handed_on_to_the_end():

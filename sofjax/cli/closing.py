@@ -22,7 +22,6 @@ from sofjax.slam import SlamState
 
 TOLD = 0.4  # share of lines that must fit where a user says that the drive ends as a loop
 SPREAD = 0.5  # metres about its middle that a path needs to show a direction
-SOLUTIONS = 4  # at most: one more after each loop that is closed
 
 
 def close(
@@ -77,21 +76,11 @@ def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
 
 def _smooth(drive, settings, tally, log, path, state) -> Closed:
     """All poses and lines at once, and again with each loop that was found."""
-    camera, mount = drive.camera_file.camera, drive.camera_file.mount
-    rules, closing = smoothing.SmoothingRules(), loop_closure.ClosingRules()
-    segment_map, asked = state.segment_map, []
-    for _ in range(SOLUTIONS):
-        done = smoothing.smooth(settings.slam, camera, mount, log, path, segment_map, rules)
-        final = smoothing.final_map(settings.slam, rules, done)
-        known = loop_closure.solved(done, final)
-        now = loop_closure.revisits(closing, known)
-        accepted = [revisit for revisit in now if revisit.closing.accepted]
-        asked += accepted[:1] or now
-        if not accepted:
-            break
-        T_world_robot, motion = loop_closure.closed(known, accepted[0])
-        segment_map = loop_closure.joined_map(done, known, motion, accepted[0])
-        path = smoothing.Path(T_world_robot, path.tilt, path.bias)
+    file = drive.camera_file
+    closed = loop_closure.close(
+        settings.slam, file.camera, file.mount, log, path, state.segment_map
+    )
+    done, final, asked = closed.smoothed, closed.final, closed.asked
     solution, T, n = done.solution, done.T_world_robot, len(done.index)
     bias = zip(
         ("distance", "left", "right", "curvature"), solution.unknowns.shared[4:], strict=True

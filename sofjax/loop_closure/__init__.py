@@ -1,13 +1,15 @@
 """A place seen again: found by the constellation of its lines, and the drive closed there.
 
-`find` looks for the lines of the last metres among those of long ago, for every pose that the
-uncertainty allows; `distribute` is the paper's closing, the error spread evenly
-back along the path.
+`close` smooths a drive, and again with each loop that it finds. `find` looks for the lines of the
+last metres among those of long ago, for every pose that the uncertainty allows; `distribute` is the
+paper's closing, the error spread evenly back along the path.
 """
 
 from sofjax.loop_closure.constellation import Closing as Closing
 from sofjax.loop_closure.constellation import ClosingRules as ClosingRules
 from sofjax.loop_closure.constellation import find as find
+from sofjax.loop_closure.drives import ClosedDrive as ClosedDrive
+from sofjax.loop_closure.drives import close as close
 from sofjax.loop_closure.revisits import Drive as Drive
 from sofjax.loop_closure.revisits import Revisit as Revisit
 from sofjax.loop_closure.revisits import closed as closed

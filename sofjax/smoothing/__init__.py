@@ -2,9 +2,9 @@
 
 Least squares by optimistix over the keyframes of a drive. The residuals are distances in pixels of
 the end points of each observed segment from its map line, transferred into the image, and the
-odometer's readings with their covariance. What makes it fast is the arrow shape of the problem: an
-observation ties one pose to one line, the odometer one pose to the next. The poses are eliminated
-by a block-tridiagonal sweep, and a dense system of the lines and of what all share remains.
+odometer's readings with their covariance. An observation ties one pose to one line, the odometer
+one pose to the next: so the drive is cut into pieces, each of which eliminates its poses and the
+lines that only it sees, and a dense system of what several pieces see remains.
 
 `solve` is one solution for associations that are given; `smooth` finds the associations as well.
 """

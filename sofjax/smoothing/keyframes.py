@@ -9,7 +9,7 @@ from sofjax.geometry.segments import Segments
 from sofjax.observation import Observation
 from sofjax.smoothing.problem import Keyframes
 
-PAD = 64  # sizes are rounded up to multiples of it, so that drives share compiled programs
+PAD = 64  # sizes are rounded up from here on, so that drives share compiled programs
 
 
 def choose(T_world_robot: SE2, distance: float, angle: float) -> np.ndarray:
@@ -32,8 +32,12 @@ def gather(log: Observation, index: np.ndarray) -> Keyframes:
     return _gather(log, filled(index), len(index))
 
 
-def padded(size: int) -> int:
-    return -(-size // PAD) * PAD
+def padded(size: int, least: int = PAD) -> int:
+    """To a power of two times `least`, or to three quarters of one."""
+    room = least
+    while room < size:
+        room *= 2
+    return room * 3 // 4 if room > least and size <= room * 3 // 4 else room
 
 
 def filled(index: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sofjax.geometry.angles import safe_norm
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, segment_to_floor
 from sofjax.geometry.lines import PolarLine, cofactor, direction, line_point_distance, normal
@@ -41,6 +42,9 @@ def lines_of(
     return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid)
 
 
+NEAREST = 256  # lines about a keyframe that its segments may show
+
+
 class Seeing(eqx.Module):
     """How segments are told to show lines."""
 
@@ -61,13 +65,17 @@ def associate(
     **Returns:** the line's index, and whether there is one within the gates.
     """
     mount = corrected(mount, unknowns.shared)
-    ends_world = lines.endpoints_world
+    K, ends_world = lines.valid.shape[0], lines.endpoints_world
 
     def of_keyframe(each):
         pose, endpoints, valid = each
         T_world_foot = SE2(pose[:2], pose[2]) @ mount.T_robot_foot
         H_F = floor_homography(camera, foot_mount(mount, pose), SE2.identity())
         seen, _ = jax.vmap(appear, in_axes=(0, 0, None))(lines.line, lines.anchor, T_world_foot)
+        apparent = T_world_foot.inverse().apply(ends_world) * seen[:, 2, None, None]
+        far = jnp.where(lines.valid, jax.vmap(_from_origin)(apparent), jnp.inf)
+        near = jax.lax.top_k(-far, min(K, NEAREST))[1]
+        seen, apparent, there = seen[near], apparent[near], lines.valid[near]
         n = normal(PolarLine(seen[:, 0], seen[:, 1]))
         l = jnp.concatenate([n, -seen[:, :1]], axis=1) @ cofactor(H_F).T
         distance = jax.vmap(jax.vmap(line_point_distance, in_axes=(0, None)), in_axes=(None, 0))
@@ -77,18 +85,24 @@ def associate(
         on_floor, some = jax.vmap(segment_to_floor, in_axes=(None, 0, None))(
             H_F, endpoints, jnp.asarray(max_depth, pose.dtype)
         )
-        apparent = T_world_foot.inverse().apply(ends_world) * seen[:, 2, None, None]
         shared = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))
         possible = (
             (jnp.maximum(jnp.abs(first), jnp.abs(second)) < seeing.gate)
             & (jnp.abs(first - second) < seeing.angle * length)
             & (shared(apparent, on_floor) > -seeing.join_gap)
-            & lines.valid
+            & there
             & (valid & some)[:, None]
         )
         off = jnp.where(possible, first**2 + second**2, jnp.inf)
-        return off.argmin(axis=1), possible.any(axis=1)
+        return near[off.argmin(axis=1)], possible.any(axis=1)
 
     return jax.lax.map(
         of_keyframe, (unknowns.pose, segments_image.endpoints, segments_image.valid), batch_size=8
     )
+
+
+def _from_origin(ends: Float[Array, "2 2"]) -> Float[Array, ""]:
+    """Distance of a segment."""
+    d = ends[1] - ends[0]
+    share = jnp.clip(-ends[0] @ d / jnp.maximum(d @ d, 1e-12), 0, 1)
+    return safe_norm(ends[0] + share * d)

@@ -9,53 +9,71 @@ from sofjax.geometry.lines import PolarLine, alignment, polar_difference
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
 from sofjax.segment_map import appear
+from sofjax.smoothing.keyframes import padded
 from sofjax.smoothing.lines import Lines
+from sofjax.smoothing.marginals import Marginals
 
 GATE = 3.0  # standard deviations between two descriptions of one line
-REACH = 0.25  # metres: beyond this what is likest may be a neighbour
+REACH, TURN = 0.25, 0.25  # metres, radians: beyond this what is likest may be a neighbour
 MODEL = (0.004, 0.01, 0.02)  # metres, radians, kappa: what no covariance knows of
 LEAST = 3  # sightings: of what is hardly seen all is possible
 GAP = 0.3  # metres between two pieces of one line
 
 
-@jax.jit
 def doubles(
-    lines: Lines, covariance: Float[Array, "K 3 K 3"], sightings: Int[Array, "K"]
-) -> tuple[Int[Array, "K"], Bool[Array, "K"]]:
+    lines: Lines, marginals: Marginals, sightings: Int[Array, "K"]
+) -> tuple[np.ndarray, np.ndarray]:
     """For each line the one that was seen more and agrees with it best, within the gates.
 
     The two are compared where the line itself is, with the covariance of their difference: two
     edges that were seen side by side are known well against each other and stay two; what was
     seen again after a long way is known badly against what was seen first.
 
-    **Returns:** the other's index, and whether there is one.
+    **Returns:** [K] the other's index, and whether there is one.
     """
     K = lines.valid.shape[0]
-    ends = lines.endpoints_world
-    model = jnp.diag(jnp.array(MODEL, lines.line.dtype) ** 2)
-    blocks = jnp.moveaxis(covariance, 2, 1)  # [K, K, 3, 3]
-    own = blocks[jnp.arange(K), jnp.arange(K)]
+    i, j = np.nonzero(np.asarray(_near(lines, sightings)))
+    into, least = np.zeros(K, int), np.full(K, np.inf)
+    if len(i):
+        room = np.zeros(padded(len(i)) - len(i), int)
+        error = np.asarray(_errors(lines, marginals, np.append(i, room), np.append(j, room)))
+        for a, b, e in zip(i, j, error, strict=False):
+            if e < min(GATE**2, least[b]):
+                into[b], least[b] = a, e
+    return into, np.isfinite(least)
+
+
+def _at(lines, k, here):
+    """A line, and how it depends on (rho, theta, kappa), about a foot."""
+    line, H = appear(lines.line[k], jax.tree.map(lambda a: a[k], lines.anchor), here)
+    return line, jnp.concatenate([H, jnp.array([[0.0, 0.0, 1.0]], H.dtype)])
+
+
+def _difference(first, second):
+    """Of two lines (rho, theta, kappa), and the sides by which the second counts in it."""
+    a, b = PolarLine(first[0], first[1]), PolarLine(second[0], second[1])
+    side = jnp.stack([alignment(a, b), jnp.ones_like(first[0]), jnp.ones_like(first[0])])
+    return jnp.append(polar_difference(a, b), first[2] - second[2]), side
+
+
+def _middle(ends):
+    return SE2(ends.mean(axis=0), jnp.zeros((), ends.dtype))
+
+
+@jax.jit
+def _near(lines: Lines, sightings: Int[Array, "K"]) -> Bool[Array, "K K"]:
+    """Pairs (i, j) of which j may be another description of i."""
+    K, ends = lines.valid.shape[0], lines.endpoints_world
 
     def of_line(j):
-        here = SE2(ends[j].mean(axis=0), jnp.zeros((), lines.line.dtype))
-
-        def against(i):
-            (a, A), (b, B) = (appear(lines.line[k], _anchor(lines, k), here) for k in (i, j))
-            A, B = (jnp.concatenate([H, jnp.array([[0.0, 0.0, 1.0]], H.dtype)]) for H in (A, B))
-            first, second = PolarLine(a[0], a[1]), PolarLine(b[0], b[1])
-            side = jnp.stack([alignment(first, second), jnp.ones_like(a[0]), jnp.ones_like(a[0])])
-            d = jnp.append(polar_difference(first, second), a[2] - b[2])
-            B = side[:, None] * B
-            cross = A @ blocks[i, j] @ B.T
-            S = A @ own[i] @ A.T + B @ own[j] @ B.T - cross - cross.T + model
-            return d, d @ jnp.linalg.solve(S, d)
-
-        d, error = jax.vmap(against)(jnp.arange(K))
+        here = _middle(ends[j])
+        line = jax.vmap(lambda k: _at(lines, k, here)[0])(jnp.arange(K))
+        d, _ = jax.vmap(_difference, in_axes=(0, None))(line, line[j])
         gap = -jax.vmap(overlap, in_axes=(None, 0))(ends[j], ends)
         more = (sightings > sightings[j]) | ((sightings == sightings[j]) & (jnp.arange(K) < j))
-        same = (
-            (error < GATE**2)
-            & (jnp.abs(d[:, 0]) < REACH)
+        return (
+            (jnp.abs(d[:, 0]) < REACH)
+            & (jnp.abs(d[:, 1]) < TURN)
             & (gap < GAP)
             & (lines.raised == lines.raised[j])
             & lines.valid
@@ -63,13 +81,29 @@ def doubles(
             & (sightings[j] >= LEAST)
             & more
         )
-        return jnp.where(same, error, jnp.inf).argmin(), same.any()
 
-    return jax.lax.map(of_line, jnp.arange(K), batch_size=8)
+    return jax.lax.map(of_line, jnp.arange(K), batch_size=8).T
 
 
-def _anchor(lines, k):
-    return jax.tree.map(lambda a: a[k], lines.anchor)
+@jax.jit
+def _errors(
+    lines: Lines, marginals: Marginals, i: Int[Array, "pairs"], j: Int[Array, "pairs"]
+) -> Float[Array, "pairs"]:
+    """Squared difference of the two, in units of its covariance."""
+    K, ends = lines.valid.shape[0], lines.endpoints_world
+    model = jnp.diag(jnp.array(MODEL, lines.line.dtype) ** 2)
+
+    def of_pair(i, j, own_i, own_j, both):
+        here = _middle(ends[j])
+        (a, A), (b, B) = _at(lines, i, here), _at(lines, j, here)
+        d, side = _difference(a, b)
+        B = side[:, None] * B
+        cross = A @ both @ B.T
+        S = A @ own_i @ A.T + B @ own_j @ B.T - cross - cross.T + model
+        return d @ jnp.linalg.solve(S, d)
+
+    of = marginals.of_lines
+    return jax.vmap(of_pair)(i, j, of(i, i, K), of(j, j, K), of(i, j, K))
 
 
 def representatives(into: np.ndarray, joins: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.extents import reaches
 from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
 from sofjax.smoothing.merging import doubles, representatives
+from sofjax.smoothing.pieces import Pieces, cut
 from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, misfit
 from sofjax.smoothing.solution import Solution, solve
 
@@ -102,17 +103,18 @@ def smooth(
             lines.raised,
             start,
         )
-        costs, merged = [], 0
+        costs, merged, pieces = [], 0, None
         for _ in range(rules.rounds):
             problem = _associated(rules.seeing, config.filter.max_depth, problem, lines)
-            problem, lines, solution = _solved(config, problem, lines)
+            pieces = _cut(problem, pieces)
+            problem, lines, solution = _solved(config, problem, lines, pieces)
             costs.append((float(solution.cost_before), float(solution.cost)))
-            into, joins = doubles(lines, solution.joint, _sightings(problem.keyframes, lines))
+            into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
             if joins.any():
                 merged += int(joins.sum())
-                name = representatives(np.asarray(into), np.asarray(joins))
-                problem, lines = _renamed(problem, lines, name)
-                problem, lines, solution = _solved(config, problem, lines)
+                problem, lines = _renamed(problem, lines, representatives(into, joins))
+                pieces = _cut(problem, pieces)
+                problem, lines, solution = _solved(config, problem, lines, pieces)
                 costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
         return jax.device_get(
@@ -184,10 +186,18 @@ def _associated(seeing: Seeing, max_depth, problem: Problem, lines: Lines) -> Pr
     return eqx.tree_at(lambda p: (p.keyframes.line, p.keyframes.known), problem, found)
 
 
-def _solved(config: SlamConfig, problem: Problem, lines: Lines):
+def _cut(problem: Problem, before: Pieces | None) -> Pieces:
+    """By the present associations, with as much room as before at least."""
+    room = (0, 0, 0)
+    if before is not None:
+        room = (before.own.shape[1], before.left.shape[0], before.border.shape[1])
+    return cut(problem.keyframes, problem.start.line.shape[0], room=room)
+
+
+def _solved(config: SlamConfig, problem: Problem, lines: Lines, pieces: Pieces):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
-    solution = solve(problem)
+    solution = solve(problem, pieces)
     return *_settled(config, problem, lines, solution), solution
 
 

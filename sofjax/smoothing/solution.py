@@ -6,10 +6,23 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from sofjax.smoothing.arrow import ArrowSolver, assemble
-from sofjax.smoothing.problem import LINE, Problem, Unknowns, residuals
+from sofjax.smoothing.blocks import Jacobian
+from sofjax.smoothing.marginals import Marginals, marginals
+from sofjax.smoothing.pieces import Pieces, PiecewiseSolver, cut, reduce
+from sofjax.smoothing.problem import Problem, Residuals, Unknowns, residuals
 
-TOLERANCE = 1e-4  # metres, radians and, relative, of the cost: of the last step
+TOLERANCE = 1e-4  # metres and radians, of the last step of any pose
+MISFIT = 1e-3  # standard deviations, root mean square, by which it changes the residuals
+
+
+def _norm(scaled: Unknowns | Residuals) -> Float[Array, ""]:
+    """By which a step is small if it is below one; a line that hardly anybody sees may wander on
+    without moving any pose.
+    """
+    if isinstance(scaled, Unknowns):
+        return jnp.maximum(jnp.abs(scaled.pose).max(), jnp.abs(scaled.shared).max())
+    flat = jnp.concatenate([part.reshape(-1) for part in jax.tree.leaves(scaled)])
+    return TOLERANCE / MISFIT * jnp.sqrt(jnp.mean(flat**2))
 
 
 class Solution(eqx.Module):
@@ -20,60 +33,61 @@ class Solution(eqx.Module):
     cost: Float[Array, ""]
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
-    pose_covariance: Float[Array, "n 5 5"]
-    line_covariance: Float[Array, "K 3 3"]
-    joint: Float[Array, "K 3 K 3"]  # covariance of all lines with each other
-    shared_covariance: Float[Array, "8 8"]
+    marginals: Marginals
     kappa_free: Float[Array, "K"]  # each line's kappa if it alone were free, poses held ...
     kappa_sigma: Float[Array, "K"]  # ... and its standard deviation
 
+    @property
+    def pose_covariance(self) -> Float[Array, "n 5 5"]:
+        return self.marginals.pose
 
-def _cost(unknowns, problem):
-    return 0.5 * sum(jnp.sum(r**2) for r in jax.tree.leaves(residuals(unknowns, problem)))
+
+def _cost(r: Residuals) -> Float[Array, ""]:
+    return 0.5 * sum(jnp.sum(part**2) for part in jax.tree.leaves(r))
 
 
-@eqx.filter_jit
-def solve(problem: Problem, max_steps: int = 60) -> Solution:
+def solve(problem: Problem, pieces: Pieces | None = None, max_steps: int = 60) -> Solution:
     """Levenberg-Marquardt from `problem.start`. Expects float64; see `jax.enable_x64`.
+
+    **Arguments:**
+    - `pieces`: of `cut`, which is asked if they are not given; it needs numbers, not tracers.
 
     **Returns:** the estimate with marginal covariances. `converged` is false where `max_steps` did
     not suffice; the estimate is then the best so far.
     """
+    if pieces is None:
+        pieces = cut(problem.keyframes, problem.start.line.shape[0])
+    return _solve(problem, pieces, max_steps)
+
+
+@eqx.filter_jit
+def _solve(problem: Problem, pieces: Pieces, max_steps: int) -> Solution:
     solver = optx.LevenbergMarquardt(
-        rtol=TOLERANCE, atol=TOLERANCE, linear_solver=ArrowSolver(problem.keyframes)
+        rtol=TOLERANCE,
+        atol=TOLERANCE,
+        norm=_norm,
+        linear_solver=PiecewiseSolver(problem.keyframes, pieces),
     )
     found = optx.least_squares(
         residuals, solver, problem.start, problem, max_steps=max_steps, throw=False
     )
     unknowns = found.value
-    _, jvp = jax.linearize(lambda u: residuals(u, problem), unknowns)
-    arrow = assemble(jvp, problem.keyframes, unknowns, 0.0)
-    Z, S = arrow.reduce()
-    rest = jnp.linalg.inv(S)
-    K = unknowns.line.shape[0]
-    pose = arrow.diagonal_of_inverse() + jnp.einsum("nib,bc,njc->nij", Z, rest, Z)
-    lines = rest[: K * LINE, : K * LINE].reshape(K, LINE, K, LINE)
-    k = jnp.arange(K)
+    r, jvp = jax.linearize(lambda u: residuals(u, problem), unknowns)
+    J, frames = Jacobian.of(jvp, unknowns), problem.keyframes
+    blocks = J.blocks(frames, 0.0)
 
     # each line alone, kappa free, about the poses found
-    _, vjp = jax.vjp(
-        lambda line: residuals(eqx.tree_at(lambda u: u.line, unknowns, line), problem).pixels,
-        unknowns.line,
-    )
-    gradient = vjp(residuals(unknowns, problem).pixels)[0]
+    _, gradient = J.transposed(frames, r)
     weak = jnp.diag(jnp.array([1e-2, 1e-2, 1 / problem.priors.kappa_sigma**2]))
-    alone = jnp.linalg.inv(arrow.line + weak)
+    alone = jnp.linalg.inv(blocks.sighted + weak)
     free = unknowns.line[:, 2] - jnp.einsum("ki,ki->k", alone[:, 2], gradient)
     return Solution(
         unknowns=unknowns,
-        cost_before=_cost(problem.start, problem),
-        cost=_cost(unknowns, problem),
+        cost_before=_cost(residuals(problem.start, problem)),
+        cost=_cost(r),
         steps=found.stats["num_steps"],
         converged=found.result == optx.RESULTS.successful,
-        pose_covariance=pose,
-        line_covariance=lines[k, :, k, :],
-        joint=lines,
-        shared_covariance=rest[K * LINE :, K * LINE :],
+        marginals=marginals(reduce(blocks, pieces)),
         kappa_free=free,
         kappa_sigma=jnp.sqrt(alone[:, 2, 2]),
     )
