@@ -22,7 +22,7 @@ import common
 
 USUAL = {"particles": 1000, "segments": 64, "map": 1024}
 SIZES = {
-    "particles": (10, 100, 1000, 10_000, 100_000),
+    "particles": (10, 100, 1000, 10_000),
     "segments": (8, 16, 32, 64, 128),
     "map": (64, 256, 1024, 4096),
 }
