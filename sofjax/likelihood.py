@@ -12,7 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, segment_to_floor
-from sofjax.geometry.lines import PolarLine, polar_difference, polar_through
+from sofjax.geometry.lines import (
+    PolarLine,
+    normal,
+    polar_difference,
+    polar_differences,
+    polar_through,
+)
 from sofjax.geometry.matrices import determinant_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
@@ -143,22 +149,17 @@ class Candidates(eqx.Module):
 def mahalanobis(
     difference: Float[Array, "*batch 2"], precision: Float[Array, "*#batch 2 2"]
 ) -> Float[Array, "*batch"]:
-    """e = dᵀ W d, written out: for a diagonal W that of the definition, (d_rho/sigma_rho)² + ..."""
-    rho, theta = difference[..., 0], difference[..., 1]
-    return (
-        precision[..., 0, 0] * rho**2
-        + 2 * precision[..., 0, 1] * rho * theta
-        + precision[..., 1, 1] * theta**2
-    )
+    """e = dᵀ W d."""
+    return _quadratic(_symmetric(precision), difference[..., 0], difference[..., 1])
 
 
 class Comparison(eqx.Module):
-    """One pose against the map."""
+    """Poses against the map; particles are the last axis, over which the loops run."""
 
-    log_likelihood: Float[Array, "*batch"]
-    choice: Int[Array, "*batch M"]  # index among the candidates
-    error: Float[Array, "*batch M"]  # e of the chosen candidate, its share of the tilt removed
-    tilt: Float[Array, "*batch 2"]  # most likely wobble (pitch, roll) of the moment, radians
+    log_likelihood: Float[Array, "*poses"]
+    choice: Int[Array, "M *poses"]  # index among the candidates
+    error: Float[Array, "M *poses"]  # e of the chosen candidate, its share of the tilt removed
+    tilt: Float[Array, "2 *poses"]  # most likely wobble (pitch, roll) of the moment, radians
 
 
 def compare(
@@ -166,34 +167,69 @@ def compare(
     sightings: Sightings,
     candidates: Candidates,
     T_predicted_foot: SE2,
-    used: Bool[Array, "M"],
+    used: Bool[Array, "M *#poses"],
 ) -> Comparison:
-    """log L = -1/2 sum_m min(min_k e[m,k], e_max) of one pose; vmap over `T_predicted_foot`.
+    """log L = -1/2 sum_m min(min_k e[m,k], e_max) of one pose or of many.
 
     The wobble of the tilt moves all segments of one image together, which independent errors
     cannot express: the associations are chosen with it as further noise, then its most likely
     value is solved for (two unknowns, prior `tilt_sigma`) and the errors are taken about it.
 
+    Written out in numbers over [M, N] instead of in 2×2 matrices for one pose under `vmap`: XLA
+    then makes loops of it that run over the particles, several times faster on a CPU. The scan over
+    the candidates also keeps it from working the poses out anew in each of those loops.
+
     **Arguments:**
-    - `T_predicted_foot`: the hypothetical foot in the predicted foot's frame, in which the
+    - `T_predicted_foot`: hypothetical feet [*poses] in the predicted foot's frame, in which the
       candidates are given: near the origin, where the polar form is accurate.
     - `used`: which sightings may match, of each particle's own SoF extraction. The others cost
       e_max too: a pose must not win by taking nothing for floor.
     """
-    difference = _difference(sightings, candidates, T_predicted_foot)
-    loose = mahalanobis(difference, candidates.precision_tilt)
-    loose = jnp.where(candidates.valid, loose, jnp.inf)
-    choice = loose.argmin(axis=1)
-    pick = lambda a: jnp.take_along_axis(a, choice.reshape(-1, 1, *[1] * (a.ndim - 2)), 1)[:, 0]
-    inlier = used & sightings.valid & (pick(loose) < sensor.e_max)
+    poses = T_predicted_foot.yaw.shape
+    of_poses = lambda tree: jax.tree.map(lambda a: a.reshape(*a.shape, *[1] * len(poses)), tree)
+    lines = (candidates.line, _nearing(candidates))
+    loose = _symmetric(candidates.precision_tilt)
+    by_candidate = jax.tree.map(lambda a: a.T, (lines, loose, candidates.valid))
 
-    d = jnp.where(inlier[:, None], pick(difference), 0)
-    W = jnp.where(inlier[:, None, None], pick(candidates.precision), 0)
-    tilt, _, prior = _solve_tilt(sensor, sightings.tilt, d, W)
-    tight = mahalanobis(d - sightings.tilt @ tilt, W)
+    def difference(line, nearing):
+        expected = _expected(line, nearing, T_predicted_foot)
+        return polar_differences(of_poses(sightings.line), expected)
+
+    def nearer(best, candidate):
+        least, choice, c = best
+        line, W, valid = of_poses(candidate)
+        error = _quadratic(W, *difference(*line))
+        less = valid & (error < least)
+        return (jnp.where(less, error, least), jnp.where(less, c, choice), c + 1), None
+
+    blank = jnp.zeros((*sightings.valid.shape, *poses))
+    best = blank + sensor.e_max, blank.astype(int), jnp.zeros((), int)
+    (least, choice, _), _ = jax.lax.scan(nearer, best, by_candidate)
+
+    def chosen(a):
+        value = of_poses(a[:, 0])
+        for c in range(1, a.shape[1]):
+            value = jnp.where(choice == c, of_poses(a[:, c]), value)
+        return value
+
+    d_rho, d_theta = difference(*jax.tree.map(chosen, lines))
+    W = jax.tree.map(chosen, _symmetric(candidates.precision))
+    inlier = used & of_poses(sightings.valid) & (least < sensor.e_max)
+    d_rho, d_theta, *W = (jnp.where(inlier, a, 0) for a in (d_rho, d_theta, *W))
+    rho, theta = of_poses(jnp.moveaxis(sightings.tilt, 0, 2))  # by (pitch, roll), each [M]
+    JW = [(W[0] * r + W[1] * t, W[1] * r + W[2] * t) for r, t in zip(rho, theta, strict=True)]
+    gradient = [jnp.sum(r * d_rho + t * d_theta, axis=0) for r, t in JW]
+    information = [
+        jnp.sum(JW[i][0] * rho[j] + JW[i][1] * theta[j], axis=0)
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    ]
+    tilt, _, prior = _solve_tilt(sensor, information, gradient)
+
+    about = lambda d, J: d - (J[0] * tilt[0] + J[1] * tilt[1])
+    tight = _quadratic(W, about(d_rho, rho), about(d_theta, theta))
     error = jnp.where(inlier, jnp.minimum(tight, sensor.e_max), sensor.e_max)
-    log_likelihood = -0.5 * (jnp.sum(jnp.where(sightings.valid, error, 0)) + prior)
-    return Comparison(log_likelihood, choice, error, tilt)
+    total = jnp.sum(jnp.where(of_poses(sightings.valid), error, 0), axis=0)
+    return Comparison(-0.5 * (total + prior), choice, error, tilt)
 
 
 def log_density(
@@ -220,9 +256,11 @@ def log_density(
     - `log_elsewhere`: log density of a segment that is no line of the map, per pixel².
     """
     there = sightings.valid[:, None] & candidates.valid
-    difference = jnp.where(
-        there[..., None], _difference(sightings, candidates, T_predicted_foot), 0
+    observed = jax.tree.map(lambda a: a[:, None], sightings.line)
+    difference = polar_difference(
+        observed, _expected(candidates.line, _nearing(candidates), T_predicted_foot)
     )
+    difference = jnp.where(there[..., None], difference, 0)
     log_area = jnp.where(sightings.valid, sightings.log_area, 0)[:, None]
     known = known[:, None]
     weights = jnp.concatenate([jnp.where(there, known / lines, 0), 1 - known], axis=1)
@@ -240,38 +278,54 @@ def log_density(
     each, total = log_mixture(difference, W_tilt)
     share = weights * jnp.exp(jnp.where(weights > 0, each - total[:, None], -jnp.inf))
     J = jnp.broadcast_to(sightings.tilt[:, None], W.shape)
-    tilt, volume, prior = _solve_tilt(sensor, J, difference, share[:, :-1, None, None] * W)
+    JW = jnp.swapaxes(J, -1, -2) @ (share[:, :-1, None, None] * W)
+    information = jnp.stack(_symmetric(jnp.sum(JW @ J, axis=(0, 1))))
+    gradient = jnp.sum((JW @ difference[..., None])[..., 0], axis=(0, 1))
+    tilt, volume, prior = _solve_tilt(sensor, information, gradient)
     _, total = log_mixture(difference - J @ tilt, W)
     return jnp.sum(jnp.where(sightings.valid, total, 0)) - 0.5 * (prior + jnp.log(volume))
 
 
-def _difference(sightings, candidates, T_predicted_foot) -> Float[Array, "M C 2"]:
-    """(rho, theta) observed less expected from a hypothetical foot, of all candidates."""
-    n = jnp.stack([-jnp.sin(candidates.line.theta), jnp.cos(candidates.line.theta)], axis=-1)
-    seen = PolarLine(
-        candidates.line.rho - candidates.kappa * (n @ T_predicted_foot.xy),
-        candidates.line.theta - T_predicted_foot.yaw,
-    )
-    observed = PolarLine(sightings.line.rho[:, None], sightings.line.theta[:, None])
-    return polar_difference(observed, seen)
+def _expected(line: PolarLine, nearing, T_predicted_foot: SE2) -> PolarLine:
+    """The candidates' lines as a hypothetical foot would see them.
 
-
-def _solve_tilt(sensor, J, d, W):
-    """The most likely wobble of errors d = J tilt + noise, two unknowns; W their precisions.
-
-    **Returns:** tilt; det(I + variance A), by which it narrows its prior; tiltᵀ tilt / variance.
+    **Arguments:**
+    - `nearing`: what a metre along x and one along y take from rho, `_nearing(candidates)`.
     """
-    JW = jnp.swapaxes(J, -1, -2) @ W
-    over = tuple(range(d.ndim - 1))
-    information = jnp.sum(JW @ J, axis=over)
-    gradient = jnp.sum((JW @ d[..., None])[..., 0], axis=over)
+    along = nearing[0] * T_predicted_foot.xy[..., 0] + nearing[1] * T_predicted_foot.xy[..., 1]
+    return PolarLine(line.rho - along, line.theta - T_predicted_foot.yaw)
+
+
+def _nearing(candidates: Candidates) -> tuple[Float[Array, "M C"], Float[Array, "M C"]]:
+    n = normal(candidates.line)
+    return candidates.kappa * n[..., 0], candidates.kappa * n[..., 1]
+
+
+def _symmetric(W: Float[Array, "*batch 2 2"]) -> tuple[Array, Array, Array]:
+    return W[..., 0, 0], W[..., 0, 1], W[..., 1, 1]
+
+
+def _quadratic(W, d_rho, d_theta):
+    """e = dᵀ W d by W's elements: for a diagonal W the definition, (d_rho/sigma_rho)² + ..."""
+    return W[0] * d_rho**2 + 2 * W[1] * d_rho * d_theta + W[2] * d_theta**2
+
+
+def _solve_tilt(sensor, information, gradient):
+    """The most likely wobble of errors d = J tilt + noise: A = Jᵀ W J and b = Jᵀ W d given.
+
+    **Arguments:**
+    - `information`: A by its elements (pitch, pitch), (pitch, roll), (roll, roll).
+
+    **Returns:** tilt; det(I + variance A), by which it narrows its prior; bᵀ tilt - tiltᵀ A tilt.
+    """
     variance = sensor.tilt_sigma**2  # (I + variance A)^-1 variance b: right for variance = 0 too
     a, b, c = (
-        1 + variance * information[0, 0],
-        variance * information[0, 1],
-        1 + variance * information[1, 1],
+        1 + variance * information[0],
+        variance * information[1],
+        1 + variance * information[2],
     )
-    g = variance * gradient
     volume = a * c - b * b
-    tilt = jnp.stack([c * g[0] - b * g[1], a * g[1] - b * g[0]]) / volume
-    return tilt, volume, jnp.sum(gradient * tilt) - tilt @ information @ tilt
+    pitch = variance * (c * gradient[0] - b * gradient[1]) / volume
+    roll = variance * (a * gradient[1] - b * gradient[0]) / volume
+    prior = gradient[0] * pitch + gradient[1] * roll - _quadratic(information, pitch, roll)
+    return jnp.stack([pitch, roll]), volume, prior

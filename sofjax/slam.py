@@ -187,15 +187,13 @@ def step(
     T_world_foot = predicted @ mount.T_robot_foot
     candidates, slot, nearest = propose(rules, sensor, state.segment_map, sightings, T_world_foot)
     feet = T_world_foot.inverse() @ (T_world_robot @ mount.T_robot_foot)
-    of_pose = lambda T, use: compare(sensor, sightings, candidates, T, use)
     if config.filter.soft:
         lines = in_view(rules, camera, mount, state.segment_map, predicted).sum()
         of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, lines)
         log_likelihood = jax.vmap(of_soft)(feet, used)
     else:
-        log_likelihood = weight * jax.vmap(lambda T, use: of_pose(T, use).log_likelihood)(
-            feet, used
-        )
+        found = compare(sensor, sightings, candidates, feet, used.T)
+        log_likelihood = weight * found.log_likelihood
     log_weight = moved.log_weight + log_likelihood
     log_evidence = jax.nn.logsumexp(log_weight)
     weighted = Particles(T_world_robot, bias, log_weight - log_evidence)
@@ -212,7 +210,9 @@ def step(
     # 6) integrate the observed segments into the map, as seen from the chosen pose
     T_world_foot_chosen = chosen @ mount.T_robot_foot
     counted = sof(chosen).is_floor if config.filter.gate_each else sightings.valid
-    best = of_pose(T_world_foot.between(T_world_foot_chosen), counted)
+    best = compare(
+        sensor, sightings, candidates, T_world_foot.between(T_world_foot_chosen), counted
+    )
     known = counted & (best.error < sensor.e_max)
     new = is_sof & (nearest > sensor.e_max) & counted & ~known
     segment_map, overflow = integrate(

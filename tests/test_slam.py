@@ -341,7 +341,7 @@ def test_a_sensor_that_stays_inconsistent_leaves_it_to_the_odometer():
     state, _ = stepped(map(frame, range(20)))
     size = {}
     for noise in (1.0, CONFIG.sensor.noise_max):
-        doubted = eqx.tree_at(lambda s: s.noise, state, jnp.full_like(state.noise, noise))
+        doubted = eqx.tree_at(lambda s: s.noise, state, jnp.asarray(noise, state.noise.dtype))
         _, info = step(CONFIG, CAMERA, MOUNT, doubted, frame(20))
         size[noise] = float(info.effective_size)
         assert info.matched > 0  # so that it can be trusted again

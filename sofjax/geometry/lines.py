@@ -60,15 +60,26 @@ def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "*batch 2"]:
     sign of rho where a line is named from its other side. Here the normal of `b` is turned to
     that of `a`, and the angle is axial, in [-pi/2, pi/2].
     """
+    return jnp.stack(polar_differences(a, b), axis=-1)
+
+
+def polar_differences(
+    a: PolarLine, b: PolarLine
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """`polar_difference` as two arrays, which compute in one loop where a pair is many."""
     turn = a.theta - b.theta
     half_turns = jnp.round(turn / jnp.pi)
-    return jnp.stack([a.rho - alignment(a, b) * b.rho, turn - jnp.pi * half_turns], axis=-1)
+    return a.rho - _side(half_turns) * b.rho, turn - jnp.pi * half_turns
 
 
 def alignment(a: PolarLine, b: PolarLine) -> Float[Array, "*batch"]:
     """1 where two lines are named from the same side, -1 where from opposite ones."""
-    half_turns = jnp.round((a.theta - b.theta) / jnp.pi)
-    return 1 - 2 * jnp.abs(jnp.remainder(half_turns, 2))
+    return _side(jnp.round((a.theta - b.theta) / jnp.pi))
+
+
+def _side(half_turns):
+    """1 for even, -1 for odd; `jnp.remainder` would be called number by number."""
+    return 1 - 2 * (half_turns - 2 * jnp.floor(half_turns / 2))
 
 
 def rename_covariance(

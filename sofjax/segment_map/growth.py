@@ -224,7 +224,7 @@ def _merge(rules, m, slot, known):
         & m.valid
         & (known & m.valid[at])[:, None]
     )
-    into = double.argmax(axis=1)
+    into = jnp.where(double, jnp.arange(K), K - 1).min(axis=1)  # the first of them
     dying = jnp.zeros(K, bool).at[at].max(double.any(axis=1))
     joins = double.any(axis=1) & ~dying[into]
 
