@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -38,7 +39,7 @@ class Solution(eqx.Module):
     kappa_sigma: Float[Array, "K"]  # ... and its standard deviation
 
     @property
-    def pose_covariance(self) -> Float[Array, "n 5 5"]:
+    def pose_covariance(self) -> Float[Array | np.ndarray, "n 5 5"]:
         return self.marginals.pose
 
 
