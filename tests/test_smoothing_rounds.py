@@ -11,7 +11,7 @@ from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floo
 from sofjax.observation import Observation
 from sofjax.segment_map import MapRules, empty_map
 from sofjax.slam import SlamConfig
-from sofjax.smoothing import Path, Seeing, SmoothingRules, Unknowns, smooth
+from sofjax.smoothing import Keyframes, Path, Seeing, SmoothingRules, Unknowns, smooth
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.lines import associate, lines_of
 from sofjax.smoothing.marginals import Marginals
@@ -196,3 +196,23 @@ def test_rounds_find_the_path_that_the_odometer_misread(rng):
     np.testing.assert_allclose(
         ends[often].mean(1)[:, 0], floor[24:].mean(1)[often][:, 0], atol=0.02
     )
+
+
+def test_segments_that_show_no_line_are_left_aside():
+    known = jnp.array([[False, True, False, True], [True, False, False, False]])
+    line = jnp.array([[0, 5, 0, 3], [2, 0, 0, 0]])
+    ends = jnp.broadcast_to(jnp.arange(4.0)[None, :, None, None], (2, 4, 2, 2))
+    still = SE2(jnp.zeros((2, 2)), jnp.zeros(2))
+    frames = Keyframes(Segments(ends, known), line, known, still, jnp.zeros((2, 3)))
+    narrow = kf.narrowed(frames, 2)
+    assert narrow.known.tolist() == [[True, True], [True, False]]
+    assert narrow.line[0].tolist() == [5, 3]
+    assert narrow.line[1, 0] == 2
+    assert narrow.segments_image.endpoints[0, :, 0, 0].tolist() == [1, 3]
+
+
+def test_sizes_are_rounded_up_to_few():
+    sizes = [kf.padded(s) for s in range(1, 1025)]
+    assert all(size >= s for s, size in enumerate(sizes, 1))
+    assert sorted(set(sizes)) == [64, 96, 128, 192, 256, 384, 512, 768, 1024]
+    assert kf.padded(5000) == 5120

@@ -10,6 +10,7 @@ from sofjax.loop_closure.constellation import ClosingRules as ClosingRules
 from sofjax.loop_closure.constellation import find as find
 from sofjax.loop_closure.drives import ClosedDrive as ClosedDrive
 from sofjax.loop_closure.drives import close as close
+from sofjax.loop_closure.revisits import AGO as AGO
 from sofjax.loop_closure.revisits import Drive as Drive
 from sofjax.loop_closure.revisits import Revisit as Revisit
 from sofjax.loop_closure.revisits import closed as closed

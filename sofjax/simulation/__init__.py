@@ -10,6 +10,8 @@ as segments straight in JAX:
 """
 
 from sofjax.simulation.catalogue import WORLDS as WORLDS
+from sofjax.simulation.catalogue import around as around
+from sofjax.simulation.catalogue import furnish as furnish
 from sofjax.simulation.catalogue import make_world as make_world
 from sofjax.simulation.drawing import Artist as Artist
 from sofjax.simulation.drawing import Imaging as Imaging

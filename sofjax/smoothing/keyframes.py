@@ -23,26 +23,39 @@ def choose(T_world_robot: SE2, distance: float, angle: float) -> np.ndarray:
     return np.array(chosen if chosen[-1] == len(yaw) - 1 else [*chosen, len(yaw) - 1])
 
 
-def gather(log: Observation, index: np.ndarray) -> Keyframes:
+def gather(log: Observation, index: np.ndarray, room: int = PAD) -> Keyframes:
     """The images of a log [T] at `index`, and what the odometer read from each to the next.
 
     **Returns:** keyframes padded by `filled`: what is added sees nothing and does not move. No
     segment is known yet.
     """
-    return _gather(log, filled(index), len(index))
+    return _gather(log, filled(index, padded(len(index), room)), len(index))
 
 
 def padded(size: int, least: int = PAD) -> int:
-    """To a power of two times `least`, or to three quarters of one."""
+    """To three or four quarters of a power of two times `least`; large sizes to its eighths."""
     room = least
     while room < size:
         room *= 2
-    return room * 3 // 4 if room > least and size <= room * 3 // 4 else room
+    if room == least:
+        return room
+    step = room // (4 if room <= 1024 else 8)
+    return -(-size // step) * step
 
 
-def filled(index: np.ndarray) -> np.ndarray:
-    """The indices, the last one repeated up to the padded size."""
-    return np.append(index, np.full(padded(len(index)) - len(index), index[-1]))
+def narrowed(frames: Keyframes, width: int) -> Keyframes:
+    """The segments that show a line come first, and only `width` of them are kept."""
+    order = jnp.argsort(~frames.known, axis=1)[:, :width]
+    take = lambda a: jnp.take_along_axis(a, order, axis=1)
+    segments = frames.segments_image
+    ends = jnp.take_along_axis(segments.endpoints, order[..., None, None], axis=1)
+    seen = Segments(ends, take(segments.valid))
+    return Keyframes(seen, take(frames.line), take(frames.known), frames.motion, frames.way)
+
+
+def filled(index: np.ndarray, size: int) -> np.ndarray:
+    """The indices, the last one repeated up to a size."""
+    return np.append(index, np.full(size - len(index), index[-1]))
 
 
 @jax.jit
@@ -73,7 +86,8 @@ def carry(T_world_robot: SE2, index: np.ndarray, smoothed: SE2) -> SE2:
     - `index`: the keyframes' images, two at least.
     - `smoothed`: poses of the keyframes, padded or not.
     """
-    return _carry(T_world_robot, filled(index), len(index), smoothed)
+    at = filled(index, len(smoothed.yaw))
+    return _carry(T_world_robot, at, len(index), smoothed)
 
 
 @jax.jit

@@ -76,7 +76,8 @@ def cut(
     alone = seen.sum(axis=0) < 2
     home = np.where(seen.any(axis=0), seen.argmax(axis=0), np.arange(K) % C)
     own = _table([np.flatnonzero(alone & (home == i)) for i in range(C)], K, max(32, room[0]))
-    left = _table([np.flatnonzero(~alone)], K, max(128, room[1]))[0]
+    left = np.flatnonzero(~alone)
+    left = np.append(left, np.full(max(padded(len(left), 128), room[1]) - len(left), K))
     place = np.full(K + 1, len(left))
     place[left] = np.arange(len(left))
     place[K] = len(left)
@@ -92,7 +93,9 @@ def cut(
 
 def _table(rows: list[np.ndarray], none: int, room: int) -> np.ndarray:
     """Rows of one width, `room` at least; what is beyond them is `none`."""
-    width = padded(max(map(len, rows)), room)
+    width = room
+    while width < max(map(len, rows)):
+        width *= 2
     return np.stack([np.append(row, np.full(width - len(row), none)) for row in rows])
 
 
@@ -108,7 +111,7 @@ class Reduced(eqx.Module):
         own, rest = _packed(self.pieces, right)
         places, B = self.pieces.places, self.pieces.size
         carried = jnp.einsum("caq,ca->cq", self.ties, own)
-        rest = rest - jnp.zeros(B + 1).at[places].add(carried)[:B]
+        rest = rest - jnp.zeros(B).at[places].add(carried, mode="drop")
         y = jnp.append(cho_solve((self.rest, True), rest), 0)
         x = jax.vmap(lambda L, r: cho_solve((L, True), r))(self.factor, own)
         x = x - jnp.einsum("caq,cq->ca", self.ties, y[places])
@@ -154,7 +157,8 @@ def reduce(blocks: Blocks, pieces: Pieces) -> Reduced:
         split(pieces.slot), pieces.own,
     ))  # fmt: skip
     places, l = pieces.places, jnp.arange(L)
-    S = jnp.zeros((B + 1, B + 1)).at[places[:, :, None], places[:, None, :]].add(H)[:B, :B]
+    at = (places[:, :, None], places[:, None, :])
+    S = jnp.zeros((B, B)).at[at].add(H, mode="drop")
     a, b = POSE * C, POSE * C + LINE * L
     diagonal = jnp.zeros((L, LINE, L, LINE)).at[l, :, l, :].set(line[pieces.left])
     to_shared = line_shared[pieces.left].reshape(LINE * L, SHARED)

@@ -24,6 +24,9 @@ from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corre
 from sofjax.smoothing.solution import Solution, solve
 
 
+NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
+
+
 class SmoothingRules(eqx.Module):
     """When a drive is smoothed, and how."""
 
@@ -33,6 +36,7 @@ class SmoothingRules(eqx.Module):
     step: float = 0.25  # heights of the camera between keyframes ...
     turn: float = 0.1  # ... or radians
     min_sightings: int = 3  # keyframes that a line takes
+    room: int = eqx.field(static=True, default=kf.PAD)  # least sizes of what is compiled
     kappa_known: float = 0.03  # standard deviation below which a line may be one of the final map
     seeing: Seeing = Seeing()
 
@@ -90,9 +94,9 @@ def smooth(
             _in_double, (config, camera, mount, log, path, segment_map, rules, priors)
         )
         index = kf.choose(path.T_world_robot, float(rules.step * mount.height), float(rules.turn))
-        frames = kf.gather(log, index)
-        lines = _lines_of_map(config.segment_map, segment_map, int(rules.min_sightings))
-        start = _start(path, index, lines)
+        frames = kf.gather(log, index, rules.room)
+        lines = _lines_of_map(config.segment_map, segment_map, rules)
+        start = _start(path, kf.filled(index, len(frames.way)), lines)
         problem = Problem(
             camera,
             mount,
@@ -104,8 +108,8 @@ def smooth(
             start,
         )
         costs, merged, pieces = [], 0, None
-        for _ in range(rules.rounds):
-            problem = _associated(rules.seeing, config.filter.max_depth, problem, lines)
+        for left in reversed(range(rules.rounds)):
+            problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
             pieces = _cut(problem, pieces)
             problem, lines, solution = _solved(config, problem, lines, pieces)
             costs.append((float(solution.cost_before), float(solution.cost)))
@@ -114,7 +118,7 @@ def smooth(
                 merged += int(joins.sum())
                 problem, lines = _renamed(problem, lines, representatives(into, joins))
                 pieces = _cut(problem, pieces)
-                problem, lines, solution = _solved(config, problem, lines, pieces)
+                problem, lines, solution = _solved(config, problem, lines, pieces, left == 0)
                 costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
         return jax.device_get(
@@ -151,10 +155,10 @@ def _in_double(tree):
     return jax.tree.map(one, tree)
 
 
-def _lines_of_map(rules: MapRules, m: SegmentMap, least: int) -> Lines:
+def _lines_of_map(rules: MapRules, m: SegmentMap, smoothing: SmoothingRules) -> Lines:
     """The map's lines that were seen often enough to be worth a solution."""
-    live = np.flatnonzero(np.asarray(m.valid & (m.updates >= least)))
-    K = kf.padded(max(len(live), 1))
+    live = np.flatnonzero(np.asarray(m.valid & (m.updates >= int(smoothing.min_sightings))))
+    K = kf.padded(max(len(live), 1), smoothing.room)
     slots = np.concatenate([live, np.zeros(K - len(live), int)])
     return _chosen(rules, m, slots, len(live))
 
@@ -170,20 +174,33 @@ def _chosen(rules, m, slots, count):
     return lines_of(m.anchor, line, m.segments_world.endpoints, raised, real)
 
 
-def _start(path: Path, index: np.ndarray, lines: Lines) -> Unknowns:
-    T, tilt, at = path.T_world_robot, path.tilt, kf.filled(index)
+def _start(path: Path, at: np.ndarray, lines: Lines) -> Unknowns:
+    T, tilt = path.T_world_robot, path.tilt
     pose = jnp.concatenate([T.xy[at], T.yaw[at, None], tilt[at]], axis=1)
     return Unknowns(pose, lines.line, jnp.concatenate([jnp.zeros(4), path.bias]))
 
 
+def _associated(
+    seeing: Seeing, max_depth: Array, problem: Problem, lines: Lines, frames: Keyframes
+) -> Problem:
+    """With the lines that the segments of `frames` show by the present estimate, and only those."""
+    line, known = _shown(seeing, max_depth, problem, lines, frames.segments_image)
+    frames = eqx.tree_at(lambda f: (f.line, f.known), frames, (line, known))
+    width = kf.padded(int(known.sum(axis=1).max()), NARROW)
+    if problem.keyframes.known.any():  # as wide as before at least
+        width = max(width, problem.keyframes.known.shape[1])
+    frames = _narrowed(frames, min(width, known.shape[1]))
+    return eqx.tree_at(lambda p: p.keyframes, problem, frames)
+
+
+_narrowed = jax.jit(kf.narrowed, static_argnums=1)
+
+
 @jax.jit
-def _associated(seeing: Seeing, max_depth, problem: Problem, lines: Lines) -> Problem:
-    """With the segments' lines as they are by the present estimate."""
-    found = associate(
-        seeing, max_depth, problem.camera, problem.mount, lines, problem.start,
-        problem.keyframes.segments_image,
-    )  # fmt: skip
-    return eqx.tree_at(lambda p: (p.keyframes.line, p.keyframes.known), problem, found)
+def _shown(seeing, max_depth, problem, lines, segments_image):
+    return associate(
+        seeing, max_depth, problem.camera, problem.mount, lines, problem.start, segments_image
+    )
 
 
 def _cut(problem: Problem, before: Pieces | None) -> Pieces:
@@ -194,10 +211,10 @@ def _cut(problem: Problem, before: Pieces | None) -> Pieces:
     return cut(problem.keyframes, problem.start.line.shape[0], room=room)
 
 
-def _solved(config: SlamConfig, problem: Problem, lines: Lines, pieces: Pieces):
+def _solved(config: SlamConfig, problem: Problem, lines: Lines, pieces: Pieces, sure=True):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
-    solution = solve(problem, pieces)
+    solution = solve(problem, pieces, sure=sure)
     return *_settled(config, problem, lines, solution), solution
 
 

@@ -47,22 +47,25 @@ def _cost(r: Residuals) -> Float[Array, ""]:
     return 0.5 * sum(jnp.sum(part**2) for part in jax.tree.leaves(r))
 
 
-def solve(problem: Problem, pieces: Pieces | None = None, max_steps: int = 60) -> Solution:
+def solve(
+    problem: Problem, pieces: Pieces | None = None, max_steps: int = 60, sure: bool = True
+) -> Solution:
     """Levenberg-Marquardt from `problem.start`. Expects float64; see `jax.enable_x64`.
 
     **Arguments:**
     - `pieces`: of `cut`, which is asked if they are not given; it needs numbers, not tracers.
+    - `sure`: whether the covariances are wanted; they cost as much as some steps.
 
-    **Returns:** the estimate with marginal covariances. `converged` is false where `max_steps` did
-    not suffice; the estimate is then the best so far.
+    **Returns:** the estimate with marginal covariances, or zeros for them. `converged` is false
+    where `max_steps` did not suffice; the estimate is then the best so far.
     """
     if pieces is None:
         pieces = cut(problem.keyframes, problem.start.line.shape[0])
-    return _solve(problem, pieces, max_steps)
+    return _solve(problem, pieces, max_steps, jnp.asarray(sure))
 
 
 @eqx.filter_jit
-def _solve(problem: Problem, pieces: Pieces, max_steps: int) -> Solution:
+def _solve(problem: Problem, pieces: Pieces, max_steps: int, sure: Bool[Array, ""]) -> Solution:
     solver = optx.LevenbergMarquardt(
         rtol=TOLERANCE,
         atol=TOLERANCE,
@@ -88,7 +91,13 @@ def _solve(problem: Problem, pieces: Pieces, max_steps: int) -> Solution:
         cost=_cost(r),
         steps=found.stats["num_steps"],
         converged=found.result == optx.RESULTS.successful,
-        marginals=marginals(reduce(blocks, pieces)),
+        marginals=_if(sure, lambda: marginals(reduce(blocks, pieces))),
         kappa_free=free,
         kappa_sigma=jnp.sqrt(alone[:, 2, 2]),
     )
+
+
+def _if(wanted, make):
+    """What `make` makes, or zeros in its place."""
+    zeros = lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(make))
+    return jax.lax.cond(wanted, make, zeros)
