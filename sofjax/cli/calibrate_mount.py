@@ -48,7 +48,7 @@ def add_parser(parts: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--joint",
         action="store_true",
-        help="then solve all poses, lines, their heights and the mount together: minutes",
+        help="then solve all poses, lines, their heights and the mount together",
     )
     parser.add_argument(
         "-o",
