@@ -36,6 +36,7 @@ from sofjax.smoothing.problem import robust
 NOISE, CAPACITY = 0.5, 1024
 
 
+@eqx.filter_jit
 def polar_fit(camera, mount, pairs, sigma):
     """The same fit with (rho, theta) of the second segment minus those of the carried line."""
     centre = jnp.eye(3).at[:2, 2].set(-camera.K[:2, 2])
@@ -66,7 +67,6 @@ def endpoint_fit(camera, mount, pairs):
     return jnp.stack([m.height, m.pitch, m.roll]), found.covariance[:3, :3]
 
 
-@eqx.filter_jit
 def fit_all(camera, mount, start, pairs, exact):
     """All three fits of one log, and the bound."""
     constant = jnp.array([5.0, 0.03])  # pixels and radians
