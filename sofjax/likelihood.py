@@ -129,11 +129,10 @@ def pixels_and_weight(
     What pixels do not explain is systematic, as the tilt of a mount that is degrees off: it does
     not average out over segments and images, and wider gates would only take neighbours for one
     another. So beyond `noise_gate` the logarithm of the likelihood counts less instead, until the
-    odometer alone decides.
+    odometer alone decides. The soft form takes the variance only: a density has no weight.
     """
-    return jnp.minimum(noise, sensor.noise_gate), sensor.noise_gate / jnp.maximum(
-        noise, sensor.noise_gate
-    )
+    variance = jnp.minimum(noise, sensor.noise_gate)
+    return variance, variance / noise
 
 
 class Candidates(eqx.Module):

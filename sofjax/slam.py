@@ -37,7 +37,7 @@ from sofjax.segment_map import (
     is_raised,
     propose,
 )
-from sofjax.sof import SofExtraction, extract
+from sofjax.sof import SofExtraction, View, extract, keep_views, view_a_baseline_away
 
 SURE = 1.5  # noise up to which the sensor may convict the wheels of a slip
 LOST_AFTER = 10  # images without one known segment
@@ -68,13 +68,6 @@ class SlamConfig(eqx.Module):
     filter: FilterRules = FilterRules()
 
 
-class View(eqx.Module):
-    """An image kept for eq. (9), and where it was taken."""
-
-    segments_image: Segments  # [M]
-    T_world_robot: SE2
-
-
 class SlamState(eqx.Module):
     """What is carried from one image to the next."""
 
@@ -94,7 +87,7 @@ class StepInfo(eqx.Module):
     covariance: Float[Array, "*batch 3 3"]  # of the particles' (x, y, yaw): in the map, not of it
     bias: Float[Array, "*batch 4"]  # its odometer's errors
     effective_size: Float[Array, "*batch"]
-    log_evidence: Float[Array, "*batch"]  # log of the mean likelihood of the particles
+    log_evidence: Float[Array, "*batch"]  # log of the mean likelihood of the particles, weighted
     tilt: Float[Array, "*batch 2"]  # wobble (pitch, roll) of the moment, radians
     misfit: Float[Array, "*batch"]  # mean error e of the matched segments; 2 if sigmas are true
     detected: Int[Array, "*batch"]
@@ -173,7 +166,7 @@ def step(
     sightings = sight(
         sensor, camera, mount, observation.segments_image, config.filter.max_depth, variance
     )
-    view = _view_a_baseline_away(config.association, state, predicted)
+    view = view_a_baseline_away(config.association, state.recent, state.reference, predicted)
     sof = lambda T: extract(
         config.association, camera, mount, view.segments_image, observation.segments_image,
         view.T_world_robot.between(T), config.filter.max_depth,
@@ -223,7 +216,9 @@ def step(
     )  # fmt: skip
 
     # 7) the next round starts from here
-    recent, reference = _keep_views(config.association, state, observation, chosen)
+    recent, reference = keep_views(
+        config.association, state.recent, state.reference, View(observation.segments_image, chosen)
+    )
     misfit = jnp.where(known, best.error, 0).sum() / jnp.maximum(known.sum(), 1).astype(float)
     noise = jnp.where(known.any(), adapt_noise(sensor, state.noise, misfit), state.noise)
     unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
@@ -298,27 +293,6 @@ def _log_density(config, camera, sightings, candidates, T_predicted_foot, floor,
     return log_density(
         config.sensor, sightings, candidates, T_predicted_foot, known, lines, elsewhere
     )
-
-
-def _far_enough(config: Association, view: View, T_world_robot: SE2) -> Bool[Array, ""]:
-    motion = view.T_world_robot.between(T_world_robot)
-    far = jnp.sum(motion.xy**2) >= config.baseline_distance**2
-    return far | (jnp.abs(motion.yaw) >= config.baseline_angle)
-
-
-def _view_a_baseline_away(config: Association, state: SlamState, T_world_robot: SE2) -> View:
-    """The most recent kept view that is far enough, so that eq. (9) can tell the floor."""
-    enough = _far_enough(config, state.recent, T_world_robot)
-    return jax.tree.map(lambda a, b: jnp.where(enough, a, b), state.recent, state.reference)
-
-
-def _keep_views(config, state, observation, T_world_robot):
-    view = View(observation.segments_image, T_world_robot)
-    first = ~state.recent.segments_image.valid.any()
-    keep = _far_enough(config, state.recent, T_world_robot) | first
-    keep = keep & observation.segments_image.valid.any()  # nothing can be compared with the dark
-    pick = lambda a, b: jax.tree.map(lambda x, y: jnp.where(keep, x, y), a, b)
-    return pick(view, state.recent), pick(state.recent, state.reference)
 
 
 class FinalMap(eqx.Module):

@@ -13,6 +13,13 @@ from sofjax.geometry.segments import Segments
 from sofjax.geometry.two_view import two_view_homography
 
 
+class View(eqx.Module):
+    """An image kept for eq. (9), and where it was taken."""
+
+    segments_image: Segments  # [M]
+    T_world_robot: SE2
+
+
 class SofExtraction(eqx.Module):
     """The second view's segments, and which of them lie on the floor."""
 
@@ -64,3 +71,26 @@ def extract(
     matches = associate(config, camera, H, first, second)  # eq. (9)
     segments_robot = put_on_floor(camera, mount, second, max_depth)  # eq. (13)
     return SofExtraction(segments_robot, matches.matched & segments_robot.valid, matches)
+
+
+def view_a_baseline_away(
+    config: Association, recent: View, reference: View, T_world_robot: SE2
+) -> View:
+    """The most recent kept view that is far enough, so that eq. (9) can tell the floor."""
+    enough = _far_enough(config, recent, T_world_robot)
+    return jax.tree.map(lambda a, b: jnp.where(enough, a, b), recent, reference)
+
+
+def keep_views(config: Association, recent: View, reference: View, view: View) -> tuple[View, View]:
+    """The two last views that were taken a baseline apart, once `view` has been."""
+    first = ~recent.segments_image.valid.any()
+    keep = _far_enough(config, recent, view.T_world_robot) | first
+    keep = keep & view.segments_image.valid.any()  # nothing can be compared with the dark
+    pick = lambda a, b: jax.tree.map(lambda x, y: jnp.where(keep, x, y), a, b)
+    return pick(view, recent), pick(recent, reference)
+
+
+def _far_enough(config: Association, view: View, T_world_robot: SE2) -> Bool[Array, ""]:
+    motion = view.T_world_robot.between(T_world_robot)
+    far = jnp.sum(motion.xy**2) >= config.baseline_distance**2
+    return far | (jnp.abs(motion.yaw) >= config.baseline_angle)

@@ -2,7 +2,7 @@
 
 A piece's own unknowns are its poses, bar the first, and the lines that are seen in it alone. What
 is left over are the first poses, the lines seen in several pieces, however far apart, and what all
-share: of an hour's drive about three thousand unknowns of thirty thousand, whatever its way.
+share.
 """
 
 import equinox as eqx

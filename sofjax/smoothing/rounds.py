@@ -23,7 +23,6 @@ from sofjax.smoothing.pieces import Pieces, cut
 from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, misfit
 from sofjax.smoothing.solution import Solution, solve
 
-
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
 
 
@@ -184,23 +183,22 @@ def _associated(
     seeing: Seeing, max_depth: Array, problem: Problem, lines: Lines, frames: Keyframes
 ) -> Problem:
     """With the lines that the segments of `frames` show by the present estimate, and only those."""
-    line, known = _shown(seeing, max_depth, problem, lines, frames.segments_image)
+    line, known = _shown(
+        seeing, max_depth, problem.camera, problem.mount, lines, problem.start,
+        frames.segments_image,
+    )  # fmt: skip
     frames = eqx.tree_at(lambda f: (f.line, f.known), frames, (line, known))
-    width = kf.padded(int(known.sum(axis=1).max()), NARROW)
+    most = int(known.sum(axis=1).max())
     if problem.keyframes.known.any():  # as wide as before at least
-        width = max(width, problem.keyframes.known.shape[1])
+        width = max(kf.padded(most, NARROW), problem.keyframes.known.shape[1])
+    else:  # better poses show more: room for them, lest all is compiled again
+        width = kf.padded(5 * most // 4, NARROW)
     frames = _narrowed(frames, min(width, known.shape[1]))
     return eqx.tree_at(lambda p: p.keyframes, problem, frames)
 
 
 _narrowed = jax.jit(kf.narrowed, static_argnums=1)
-
-
-@jax.jit
-def _shown(seeing, max_depth, problem, lines, segments_image):
-    return associate(
-        seeing, max_depth, problem.camera, problem.mount, lines, problem.start, segments_image
-    )
+_shown = jax.jit(associate)
 
 
 def _cut(problem: Problem, before: Pieces | None) -> Pieces:
@@ -238,9 +236,10 @@ def _settled(config, problem, lines, solution):
 
 def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
     """Lines that are one go on as one: their segments show it, and its reach is that of all."""
-    frames = problem.keyframes
+    line = problem.keyframes.line
     lines = eqx.tree_at(lambda l: l.valid, lines, lines.valid & (name == np.arange(len(name))))
-    return eqx.tree_at(lambda p: p.keyframes.line, problem, jnp.asarray(name)[frames.line]), lines
+    line = jnp.asarray(name, line.dtype)[line]  # of the type that `_solve` was compiled for
+    return eqx.tree_at(lambda p: p.keyframes.line, problem, line), lines
 
 
 @jax.jit
