@@ -10,7 +10,7 @@ from conftest import jit_quickly, make_camera
 
 from sofjax.calibration import TURNS, UNKNOWNS, FitRules, PairNoise, Pairs, distances, expected
 from sofjax.calibration import fit_mount as compiled_well
-from sofjax.calibration.fit import verdict
+from sofjax.calibration.fit import doubts, verdict
 from sofjax.calibration.heights import FloorRules, on_floor
 from sofjax.calibration.pairs import Estimate, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
@@ -173,6 +173,27 @@ def test_yaw_and_the_odometer_s_turns_can_be_free_too(camera, mount, rng):
     np.testing.assert_allclose(value(found), list(FIT.values()), atol=1e-3)
     assert float(found.mount.yaw) == pytest.approx(0.06, abs=1e-3)
     np.testing.assert_allclose(found.odometer, bias, atol=1e-3)
+
+
+def test_an_odometer_put_far_off_its_prior_widens_all_error_bars(camera, mount, rng):
+    """The same drive, read right and read 30 % short in left turns, is known less by the ratio."""
+    motion = np.stack(
+        [rng.uniform(0.3, 0.9, N), rng.normal(0, 0.02, N), rng.uniform(0.1, 0.3, N)], axis=1
+    )
+    pairs = weighed(camera, mount, make_pairs(camera, mount, rng, motion, noise=0.3))
+    short = eqx.tree_at(
+        lambda p: p.T_first_second,
+        pairs,
+        jax.vmap(Estimate(mount, jnp.array([0.0, -0.3, 0.0, 0.0])).motion)(pairs.T_first_second),
+    )
+    rules = FitRules(free=("height", "pitch", "roll", "left"))
+    right, wrong = (fit_mount(camera, mount, p, rules) for p in (pairs, short))
+    assert float(right.surprise) == 1 and doubts(right) == ""
+    sigmas = float(wrong.odometer[1]) / rules.prior_sigma[5]
+    assert float(wrong.surprise) == pytest.approx(abs(sigmas)) and sigmas > 5
+    assert "clock or odometer" in doubts(wrong)
+    ratio = np.sqrt(np.diag(wrong.covariance)[:3] / np.diag(right.covariance)[:3])
+    np.testing.assert_allclose(ratio, sigmas, rtol=0.3)
 
 
 def test_outliers_hardly_matter(camera, mount, rng):

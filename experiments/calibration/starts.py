@@ -1,6 +1,7 @@
 """Where does the mount of a drive end, begun from 24 places far from its own?
 
-    python experiments/calibration/starts.py DRIVE [--scale 0.99] [--heights 6] [--tilts 4] [--each 1]
+    python experiments/calibration/starts.py DRIVE [--scale 0.99] [--heights 6] [--tilts 4]
+        [--each 1] [--out DIR]
 
 30 % too high to 30 % too low, 8° too steep to 8° too flat, about what the drive's camera file says.
 If that is the truth, as on a drive that was drawn, the errors are too: of the height over the

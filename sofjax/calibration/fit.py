@@ -34,6 +34,8 @@ class FitRules(eqx.Module):
 
 
 DEFAULT = FitRules()
+ODOMETER = slice(4, None)  # of UNKNOWNS
+DOUBT = 2.0  # of `surprise`: three errors are together so far off by chance in 1 of 140 drives
 
 
 class CalibrationResult(eqx.Module):
@@ -46,6 +48,9 @@ class CalibrationResult(eqx.Module):
     observable: Bool[Array, "8"]  # whether each of UNKNOWNS was free and the pairs fix it
     blind: Float[Array, "8"]  # the direction that is known least, in shares of `limit`, a unit ...
     blindness: Float[Array, ""]  # ... and its standard deviation in the same; > 1 is no answer
+    # how far off its prior the odometer had to be put, root mean square in sigmas, 1 at least: the
+    # covariance is wider by it
+    surprise: Float[Array, ""]
     cost: Float[Array, ""]  # half the sum of robust squares, in sigmas
     result: optx.RESULTS  # of the solver; an estimate that did not converge is the best so far
 
@@ -96,9 +101,9 @@ def _fit(
     )
     by = jnp.where(is_free, found.value, 0)
     estimate = start.moved(by)
-    covariance = jnp.where(
-        is_free[:, None] & is_free, _sandwich(residuals, by, pairs, prior, pixel_sigma), 0
-    )
+    surprise = _surprise(by[ODOMETER] / prior[ODOMETER], is_free[ODOMETER])
+    covariance = surprise**2 * _sandwich(residuals, by, pairs, prior, pixel_sigma)
+    covariance = jnp.where(is_free[:, None] & is_free, covariance, 0)
     spread, direction, sure = _blindness(limit, covariance)
     enough = jnp.sum(pairs.valid) >= min_pairs
     unit = jnp.ones(U).at[0].set(estimate.mount.height)  # log height to metres
@@ -111,6 +116,7 @@ def _fit(
         observable=is_free & sure & enough,
         blind=direction,
         blindness=spread,
+        surprise=surprise,
         cost=0.5 * (jnp.sum(r**2) + jnp.sum(known**2)),
         result=found.result,
     )
@@ -157,6 +163,16 @@ def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "
     return root * jnp.maximum(values, independent) @ root.T
 
 
+def _surprise(off, is_free) -> Float[Array, ""]:
+    """How far values lie off their priors, root mean square in sigmas; 1 at least (Birge's ratio).
+
+    What the clusters share, such as a wrong lens or clock, no covariance from their differences
+    shows: it shows in an odometer that must be further off than odometers are.
+    """
+    count = jnp.maximum(jnp.sum(is_free.astype(off.dtype)), 1)
+    return jnp.sqrt(jnp.maximum(jnp.sum(jnp.where(is_free, off, 0) ** 2) / count, 1))
+
+
 def _blindness(limit, covariance):
     """The widest direction of the covariance in units of what an answer may have at most."""
     values, vectors = jnp.linalg.eigh(covariance / jnp.outer(limit, limit))
@@ -174,15 +190,27 @@ def verdict(found: CalibrationResult, rules: FitRules, pairs: Pairs) -> tuple[bo
         )
     sigma = jnp.sqrt(jnp.diag(found.covariance)).at[0].divide(found.mount.height)
     wide = [
-        f"the {name} ({_amount(name, float(s))})"
+        f"the {_ERRORS.get(name, name)} ({_amount(name, float(s))})"
         for name, s, most in zip(UNKNOWNS, sigma, limit, strict=True)
         if name in rules.free and s > most
     ]
     if wide:
-        return False, f"not observable from this drive: {' and '.join(wide)}; {_WHY}"
+        doubt = doubts(found)
+        return False, f"not observable from this drive: {' and '.join(wide)}; {doubt or _WHY}"
     if found.result != optx.RESULTS.successful:
         return False, "the fit did not converge"
     return True, ""
+
+
+def doubts(found: CalibrationResult) -> str:
+    """What speaks against a fit that converged, in words; empty if nothing."""
+    if found.surprise < DOUBT:
+        return ""
+    return (
+        f"it takes an odometer {float(found.surprise):.1f} times further off than odometers are, "
+        "so camera, clock or odometer are not what they are taken for, and the errors told are "
+        "wider by as much"
+    )
 
 
 _WHY = (
@@ -191,7 +219,17 @@ _WHY = (
 )
 
 
+_ERRORS = {
+    "distance": "odometer's error in distance",
+    "left": "odometer's error in left turns",
+    "right": "odometer's error in right turns",
+    "curvature": "odometer's pull to one side",
+}
+
+
 def _amount(name: str, sigma: float) -> str:
     if name in ("height", "distance", "left", "right"):
         return f"known to {100 * sigma:.2g} %"
+    if name == "curvature":
+        return f"known to {sigma * 57.29578:.2g}° a metre"
     return f"known to {sigma * 57.29578:.2g}°"

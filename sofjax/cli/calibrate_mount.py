@@ -160,6 +160,7 @@ def calibrate(
     import numpy as np
 
     from sofjax.calibration import TURNS, DriveRules, FitRules, fit_drive
+    from sofjax.calibration.fit import doubts
     from sofjax.calibration.report import SCALE, estimates
     from sofjax.vision import Frontend
 
@@ -190,7 +191,9 @@ def calibrate(
     rms = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.nan
     lines = estimates(fitted, odometer, covariance, rules.fit.free)
     pairs = len(residuals)
-    verdict = _words(fitted, covariance) if usable else why
+    doubt = doubts(found.fit)
+    verdict = _words(fitted, covariance) + f"; {doubt}" * bool(doubt) if usable else why
+    word = ("doubtful" if doubt else "good") if usable else "not usable"
     count = f"{pairs} of {found.related} pairs of segments taken for floor"
     count += ", then jointly with poses and lines" * (usable and joint)
     print_lines = [
@@ -199,7 +202,7 @@ def calibrate(
         f"  residual  {rms:.2f} px, root mean square",
         f"  starts    {found.agreeing} of {len(found.ends)} end in the same place",
         f"  scale     {SCALE}",
-        f"  verdict   {'good' if usable else 'not usable'}: {verdict}",
+        f"  verdict   {word}: {verdict}",
     ]
     values = np.array([fitted.height, fitted.pitch, fitted.roll, fitted.yaw], float)
     numbers = {
@@ -208,6 +211,7 @@ def calibrate(
         "pairs": pairs,
         "related": found.related,
         "residual_px": rms,
+        "surprise": float(found.fit.surprise),
         "starts_agreeing": found.agreeing,
         "before": {k: float(getattr(mount, k)) for k in FREE[:4]},
         "after": dict(zip(FREE[:4], values.tolist(), strict=True)),
