@@ -61,7 +61,8 @@ def see(segment_map, *ends, at=None, slots=None, rules=GAMMA, sigma=0.01, view=(
     new = sightings.valid & ~known
     shown = jnp.zeros(K, bool).at[jnp.array(view, int)].set(True)
     return grow(
-        rules, STIFF, segment_map, sightings, slot, known, new, jnp.zeros(2), shown, at
+        rules, STIFF, segment_map, jnp.arange(K), sightings, slot, known, new,
+        jnp.zeros(2), shown, at,
     )  # fmt: skip
 
 
@@ -207,7 +208,7 @@ def test_correlated_errors_turn_with_the_name_when_a_line_is_updated():
     known = jnp.arange(M) < 1
     there, back = (
         grow(
-            KALMAN, STIFF, m, s, jnp.zeros(M, int), known, ~known & s.valid,
+            KALMAN, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), known, ~known & s.valid,
             jnp.zeros(2), jnp.zeros(K, bool), pose(),
         )[0]
         for s in named_both_ways()
@@ -532,8 +533,8 @@ def test_a_wobble_is_taken_out_of_what_is_integrated():
     m = seen(empty_map(GAMMA), across(1.0))
     known = jnp.arange(M) < 1
     after, _ = grow(
-        GAMMA, STIFF, m, sightings, jnp.zeros(M, int), known, ~known & sightings.valid,
-        jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
+        GAMMA, STIFF, m, jnp.arange(K), sightings, jnp.zeros(M, int), known,
+        ~known & sightings.valid, jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
     )  # fmt: skip
     assert offset(after) == pytest.approx(1.0)
 

@@ -49,9 +49,7 @@ def propose(
     extent = (
         T_world_foot.inverse().apply(segment_map.segments_world.endpoints) * seen[:, 2, None, None]
     )
-    share = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))(
-        extent, sightings.endpoints_foot
-    )
+    share = overlap(extent, sightings.endpoints_foot[:, None])
     possible = segment_map.valid & (share > -rules.join_gap)
     if rules.directed:
         possible = possible & (jnp.abs(wrap(observed.theta - lines.theta)) < jnp.pi / 2)
