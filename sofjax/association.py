@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.camera import Camera
-from sofjax.geometry.lines import line_through, polar, polar_difference, transfer_line
+from sofjax.geometry.lines import line_through, polar, polar_differences, transfer_line
 from sofjax.geometry.segments import Segments, overlap
 from sofjax.geometry.two_view import transfer_segment
 
@@ -55,8 +55,8 @@ def association_error(
     moved, ahead = transfer_segment(H_centred, first - centre)
     l2 = polar(transfer_line(H_centred, line_through(*(first - centre))))  # l'' = H^-T l
     l1 = polar(line_through(*(second - centre)))  # l'
-    d_rho, d_theta = jnp.abs(polar_difference(l1, l2))
-    error = config.alpha * d_rho + config.beta * d_theta
+    d_rho, d_theta = polar_differences(l1, l2)
+    error = config.alpha * jnp.abs(d_rho) + config.beta * jnp.abs(d_theta)
     return jnp.where(ahead & (overlap(moved, second - centre) > 0), error, jnp.inf)
 
 

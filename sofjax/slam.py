@@ -35,6 +35,7 @@ from sofjax.segment_map import (
     in_view,
     integrate,
     is_raised,
+    nearby,
     propose,
 )
 from sofjax.sof import SofExtraction, View, extract, keep_views, view_a_baseline_away
@@ -42,6 +43,7 @@ from sofjax.sof import SofExtraction, View, extract, keep_views, view_a_baseline
 SURE = 1.5  # noise up to which the sensor may convict the wheels of a slip
 LOST_AFTER = 10  # images without one known segment
 ACROSS = 0.5  # sine of the angle from the heading beyond which a line runs across the way
+MARGIN = 1.0  # metres by which a map line may be off and still be compared
 KNOWN = 0.5  # prior probability that a segment on the floor is one of the map; of the soft form
 
 
@@ -97,6 +99,7 @@ class StepInfo(eqx.Module):
     across: Int[Array, "*batch"]  # of them, those that run across the heading and hold the distance
     born: Int[Array, "*batch"]  # new in the map
     map_overflow: Int[Array, "*batch"]  # found no free slot
+    map_hidden: Int[Array, "*batch"]  # lines within sight beyond the L that are compared
     lost: Bool[Array, "*batch"]
     segment_class: Int[Array, "*batch M"]  # 0 none, 1 above the horizon, 2 not floor, 3 floor
 
@@ -178,11 +181,15 @@ def step(
 
     # 5) compare with the map by the sensor model, and choose
     T_world_foot = predicted @ mount.T_robot_foot
-    candidates, slot, nearest = propose(rules, sensor, state.segment_map, sightings, T_world_foot)
+    ends = jnp.where(sightings.valid[:, None, None], sightings.endpoints_foot, 0)
+    reach = jnp.sqrt(jnp.sum(ends**2, axis=-1).max()) + rules.join_gap + MARGIN
+    near, hidden = nearby(rules, state.segment_map, T_world_foot, reach)
+    lines = state.segment_map.take(near)
+    candidates, at, nearest = propose(rules, sensor, lines, sightings, T_world_foot)
     feet = T_world_foot.inverse() @ (T_world_robot @ mount.T_robot_foot)
     if config.filter.soft:
-        lines = in_view(rules, camera, mount, state.segment_map, predicted).sum()
-        of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, lines)
+        many = in_view(rules, camera, mount, lines, predicted).sum()
+        of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, many)
         log_likelihood = jax.vmap(of_soft)(feet, used)
     else:
         found = compare(sensor, sightings, candidates, feet, used.T)
@@ -209,10 +216,10 @@ def step(
     known = counted & (best.error < sensor.e_max)
     new = is_sof & (nearest > sensor.e_max) & counted & ~known
     segment_map, overflow = integrate(
-        rules, sensor, state.segment_map, sightings,
-        jnp.take_along_axis(slot, best.choice[:, None], 1)[:, 0],
+        rules, sensor, state.segment_map, near, sightings,
+        jnp.take_along_axis(at, best.choice[:, None], 1)[:, 0],
         known, new, best.tilt,
-        in_view(rules, camera, mount, state.segment_map, chosen), T_world_foot_chosen,
+        in_view(rules, camera, mount, lines, chosen), T_world_foot_chosen,
     )  # fmt: skip
 
     # 7) the next round starts from here
@@ -238,6 +245,7 @@ def step(
         across=(known & (jnp.abs(jnp.sin(sightings.line.theta)) > ACROSS)).sum(),
         born=new.sum() - overflow,
         map_overflow=overflow,
+        map_hidden=hidden,
         lost=unmatched >= LOST_AFTER,
         segment_class=sum(
             stage.astype(int)

@@ -22,6 +22,7 @@ from sofjax.segment_map import (
     in_view,
     integrate,
     is_raised,
+    nearby,
     propose,
 )
 
@@ -61,7 +62,8 @@ def see(segment_map, *ends, at=None, slots=None, rules=GAMMA, sigma=0.01, view=(
     new = sightings.valid & ~known
     shown = jnp.zeros(K, bool).at[jnp.array(view, int)].set(True)
     return grow(
-        rules, STIFF, segment_map, sightings, slot, known, new, jnp.zeros(2), shown, at
+        rules, STIFF, segment_map, jnp.arange(K), sightings, slot, known, new,
+        jnp.zeros(2), shown, at,
     )  # fmt: skip
 
 
@@ -207,7 +209,7 @@ def test_correlated_errors_turn_with_the_name_when_a_line_is_updated():
     known = jnp.arange(M) < 1
     there, back = (
         grow(
-            KALMAN, STIFF, m, s, jnp.zeros(M, int), known, ~known & s.valid,
+            KALMAN, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), known, ~known & s.valid,
             jnp.zeros(2), jnp.zeros(K, bool), pose(),
         )[0]
         for s in named_both_ways()
@@ -532,8 +534,8 @@ def test_a_wobble_is_taken_out_of_what_is_integrated():
     m = seen(empty_map(GAMMA), across(1.0))
     known = jnp.arange(M) < 1
     after, _ = grow(
-        GAMMA, STIFF, m, sightings, jnp.zeros(M, int), known, ~known & sightings.valid,
-        jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
+        GAMMA, STIFF, m, jnp.arange(K), sightings, jnp.zeros(M, int), known,
+        ~known & sightings.valid, jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
     )  # fmt: skip
     assert offset(after) == pytest.approx(1.0)
 
@@ -624,6 +626,48 @@ def test_a_piece_beyond_the_end_of_its_line_is_proposed_up_to_the_gap():
         )
         assert bool(candidates.valid[0, 0]) == expected
         assert bool(np.isfinite(nearest[0])) == expected
+
+
+def test_the_lines_nearby_are_all_that_a_loop_finds_within_reach(rng):
+    """If they are no more than L; else the nearest, and what is left out within reach is told."""
+    m, at = random_map(rng), pose(0.4, -0.3, 1.0)
+    distance = []
+    for ends, kappa in zip(m.segments_world.endpoints, m.line[:, 2], strict=True):
+        a, b = np.asarray(ends) - np.asarray(at.xy)
+        points = a + np.linspace(0, 1, 100_001)[:, None] * (b - a)
+        distance.append(float(kappa) * np.linalg.norm(points, axis=1).min())
+    order = [k for k in np.argsort(distance) if m.valid[k]]
+    assert 4 < len(order) < K
+    for L in (1, 3, len(order), K):
+        reach = 0.5 * (distance[order[3]] + distance[order[4]])  # four of them lie within it
+        slots, hidden = nearby(dataclasses.replace(KALMAN, nearby=L), m, at, jnp.array(reach))
+        found = [int(k) for k in slots if k < K]
+        assert found == sorted(order[: len(found)]) and len(found) <= L
+        assert hidden == max(0, 4 - len(found))
+        assert len(found) == len(order) or L < len(order)
+        taken = m.take(slots)
+        np.testing.assert_array_equal(taken.valid, np.asarray(slots) < K)
+        assert_bitwise_equal(m.put(slots, taken), m)
+
+
+def test_lines_beyond_those_nearby_only_age():
+    rules = dataclasses.replace(GAMMA, nearby=2)
+    m = seen(empty_map(rules), across(1.0), across(2.0), rules=rules)
+    m = seen(m, across(1.0), at=pose(0, 29), rules=rules)
+    before = m.unseen[:3]
+    near, _ = nearby(rules, m, pose(), jnp.array(6.0))
+    np.testing.assert_array_equal(near, [0, 1])
+    known = jnp.arange(M) < 1
+    after, _ = jit_quickly(integrate)(
+        rules, STIFF, m, near, sightings_of(across(2.2)), jnp.ones(M, int), known, ~known & known,
+        jnp.zeros(2), jnp.zeros(2, bool), pose(),
+    )  # fmt: skip
+    np.testing.assert_array_equal(after.updates[:3], [1, 2, 1])
+    np.testing.assert_array_equal(
+        after.unseen[:3], before * jnp.array([1, 0, 1]) + jnp.array([1, 0, 1])
+    )
+    np.testing.assert_array_equal(ends_of(after, 2), ends_of(m, 2))
+    assert offset(after, 1) == pytest.approx(2.1)
 
 
 def test_what_is_in_view_worked_by_hand(camera):

@@ -1,9 +1,10 @@
-"""What a step costs, by particles, segments of an image, slots of the map, and processes.
+"""What a step costs, by particles, segments of an image, slots of the map, runs, and processes.
 
     python experiments/scaling/run.py [--quick] [--images 20] [--out DIR]
 
-One stretch of a drive is run with one size changed at a time; compiling is told apart. The last
-part shares the particles of one filter among processes by jax.distributed, against one process:
+One stretch of a drive is run with one size changed at a time; compiling is told apart. Then 64
+runs of 256 particles over 300 images, one call after the other and all in one call. The last part
+shares the particles of one filter among processes by jax.distributed, against one process:
 on one machine this shows that the results are the same, not that it is faster, as one process
 uses all cores already. On a cluster, start `worker.py` on each machine.
 """
@@ -65,6 +66,43 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
     }
 
 
+def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, float]:
+    """Seconds of one call for many seeds of the filter, and of a call for each, alternating."""
+    import jax
+
+    from sofjax import slam
+
+    drive = common.random_drive("random", seed, images)
+    args = (drive.camera, drive.mount, jax.tree.map(jax.numpy.asarray, drive.observations))
+    config = common.config_of(filter={"particles": 256})
+    keys = jax.random.split(jax.random.key(seed), runs)
+    together = lambda args, keys: common.run_batch(
+        config, *jax.tree.map(lambda a: jax.numpy.broadcast_to(a, (runs, *a.shape)), args), keys
+    )
+
+    @jax.jit
+    def alone(args, key):
+        return slam.run(config, *args[:2], slam.init(config, *args[:2], key, common.M), args[2])[1]
+
+    def timed(call):
+        c, w = time.process_time(), time.perf_counter()
+        jax.block_until_ready(call())
+        return time.process_time() - c, time.perf_counter() - w
+
+    calls = lambda: [jax.block_until_ready(alone(args, key)) for key in keys]
+    compiling = {
+        "one": timed(lambda: alone(args, keys[0])),
+        "many": timed(lambda: together(args, keys)),
+    }
+    one, many = np.median([(timed(calls), timed(lambda: together(args, keys)))
+                           for _ in range(rounds)], axis=0)  # fmt: skip
+    return {
+        "runs": runs, "images": images, "calls_cpu_s": one[0], "calls_wall_s": one[1],
+        "call_cpu_s": many[0], "call_wall_s": many[1], "cpu_ratio": one[0] / many[0],
+        "wall_ratio": one[1] / many[1], "first_cpu_s": {k: v[0] for k, v in compiling.items()},
+    }  # fmt: skip
+
+
 def draw(table: dict, path: Path) -> None:
     plot, axes = common.pyplot().subplots(1, 3, figsize=(12, 3.6), layout="constrained")
     for axis, (name, rows) in zip(axes, table.items(), strict=True):
@@ -108,11 +146,13 @@ def main():
             table[name][size] = row
             print(f"{size:7d} {name:10s}" + "".join(f"{k} {v:9.2f}   " for k, v in row.items()),
                   flush=True)  # fmt: skip
+    runs = many_runs(args.seed, *(10, 4) if args.quick else (300, 64))
+    print(json.dumps(runs, indent=1), flush=True)
     one, many = start(args, 1), start(args, args.processes)
     apart = float(np.abs(np.array(one.pop("xy")) - np.array(many.pop("xy"))).max())
     processes = {"one": one, "many": many, "furthest_apart_m": apart}
     print(json.dumps(processes, indent=1))
-    common.save(args.out, "scaling", args, {"steps": table, "processes": processes})
+    common.save(args.out, "scaling", args, {"steps": table, "runs": runs, "processes": processes})
     draw(table, args.out / "scaling.png")
 
 

@@ -163,6 +163,11 @@ def warnings(drive: Drive, tally: Tally) -> list[str]:
             f"the map was full, and {tally.step['map_overflow']} new lines found no place; "
             "segment_map.capacity makes room"
         )
+    if tally.step["map_hidden"]:
+        found.append(
+            f"more lines lay within sight than are compared, {tally.step['map_hidden'] / n:.0f} an "
+            "image on average; segment_map.nearby makes room"
+        )
     if tally.unheld > UNHELD:
         found.append(
             f"for {tally.unheld:.1f} m no line across the way was matched to the map: the distance "

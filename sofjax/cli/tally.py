@@ -15,7 +15,15 @@ from sofjax.slam import FinalMap, StepInfo
 from sofjax.vision import View
 
 WARM = 10  # images that timing leaves out: the first one compiles
-OF_THE_STEP = ("below_horizon", "associated", "matched", "born", "map_overflow", "lost")
+OF_THE_STEP = (
+    "below_horizon",
+    "associated",
+    "matched",
+    "born",
+    "map_overflow",
+    "map_hidden",
+    "lost",
+)
 
 
 @dataclass

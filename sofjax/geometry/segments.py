@@ -26,15 +26,18 @@ class Segments(eqx.Module):
         return safe_norm(self.endpoints[..., 1, :] - self.endpoints[..., 0, :])
 
 
-def overlap(first: Float[Array, "2 2"], second: Float[Array, "2 2"]) -> Float[Array, ""]:
+def overlap(
+    first: Float[Array, "*#batch 2 2"], second: Float[Array, "*#batch 2 2"]
+) -> Float[Array, "*batch"]:
     """Length that two segments share along the direction of the second; text below eq. (9).
 
-    Negative is the gap between them; zero if the second has no length.
+    Negative is the gap between them; zero if the second has no length. In numbers and not as
+    products of matrices, which would not fuse where batches are broadcast to all pairs.
     """
-    d = second[1] - second[0]
-    unit = safe_divide(d, safe_norm(d))
-    a0, a1 = first @ unit  # elementwise, as a reduction over two would not fuse over all pairs
-    b0, b1 = second @ unit
+    d = second[..., 1, :] - second[..., 0, :]
+    unit = safe_divide(d, safe_norm(d)[..., None])
+    along = lambda x: x[..., 0] * unit[..., 0] + x[..., 1] * unit[..., 1]
+    a0, a1, b0, b1 = (along(ends[..., i, :]) for ends in (first, second) for i in (0, 1))
     low = jnp.maximum(jnp.minimum(a0, a1), jnp.minimum(b0, b1))
     return jnp.minimum(jnp.maximum(a0, a1), jnp.maximum(b0, b1)) - low
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sofjax.geometry.angles import wrap
-from sofjax.geometry.lines import PolarLine, alignment, polar_difference, rename_covariance
+from sofjax.geometry.lines import PolarLine, alignment, polar_differences, rename_covariance
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
@@ -41,7 +41,7 @@ def propose(
     observed = PolarLine(sightings.line.rho[:, None], sightings.line.theta[:, None])
     side = alignment(observed, lines)  # a sighting may be named from the other side
     s = lambda i, j: near[:, None, i, j] + (1 if i == j else side) * far[:, i, j]
-    d_rho, d_theta = jnp.moveaxis(polar_difference(observed, lines), -1, 0)
+    d_rho, d_theta = polar_differences(observed, lines)
     error = s(1, 1) * d_rho**2 - 2 * s(0, 1) * d_rho * d_theta + s(0, 0) * d_theta**2
     error = error / (s(0, 0) * s(1, 1) - s(0, 1) ** 2)
 
@@ -49,9 +49,7 @@ def propose(
     extent = (
         T_world_foot.inverse().apply(segment_map.segments_world.endpoints) * seen[:, 2, None, None]
     )
-    share = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))(
-        extent, sightings.endpoints_foot
-    )
+    share = overlap(extent, sightings.endpoints_foot[:, None])
     possible = segment_map.valid & (share > -rules.join_gap)
     if rules.directed:
         possible = possible & (jnp.abs(wrap(observed.theta - lines.theta)) < jnp.pi / 2)

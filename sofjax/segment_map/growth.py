@@ -28,57 +28,59 @@ def integrate(
     rules: MapRules,
     sensor: SensorModel,
     segment_map: SegmentMap,
+    near: Int[Array, "L"],
     sightings: Sightings,
-    slot: Int[Array, "M"],
+    at: Int[Array, "M"],
     known: Bool[Array, "M"],
     new: Bool[Array, "M"],
     tilt: Float[Array, "2"],
-    in_view: Bool[Array, "K"],
+    in_view: Bool[Array, "L"],
     T_world_foot: SE2,
 ) -> tuple[SegmentMap, Int[Array, ""]]:
-    """Step 6 of Fig. 6: an observed segment updates the known line in `slot` or begins a new one.
+    """Step 6 of Fig. 6: an observed segment updates the known line `near[at]` or begins a new one.
 
     **Arguments:**
-    - `slot`, `known`: which map line each sighting is, if any.
+    - `near`: slots of the lines that this image may show, of `nearby`; the others only age.
+    - `at`, `known`: which of them each sighting is, if any.
     - `new`: sightings that begin a line.
     - `tilt`: wobble (pitch, roll) to correct the sightings for.
-    - `in_view`: which map lines this image should show, of `in_view`.
+    - `in_view`: which of them this image should show, of `in_view`.
     - `T_world_foot`: the chosen pose.
 
     **Returns:** the map, and how many new lines found no free slot.
     """
-    segment_map = _update(
-        rules, sensor, segment_map, sightings, slot, known, tilt, in_view, T_world_foot
-    )
+    some = segment_map.take(near)
+    some = _update(rules, sensor, some, sightings, at, known, tilt, in_view, T_world_foot)
+    some = _merge(rules, some, at, known)
+    segment_map = _age(segment_map, sightings).put(near, some)
     segment_map, overflow = _insert(rules, segment_map, sightings, new, tilt, T_world_foot)
-    segment_map = _merge(rules, segment_map, slot, known)
     return _forget(rules, segment_map), overflow
 
 
 class _Measurement(eqx.Module):
     """What one image says of each map line: pieces of one line are one measurement of it."""
 
-    touched: Bool[Array, "K"]
-    innovation: Float[Array, "K 2"]  # (rho, theta) observed less expected, in the present foot
-    precision: Float[Array, "K 2 2"]  # zero where nothing was seen
-    covariance: Float[Array, "K 2 2"]  # its inverse; zero where nothing was seen
-    expected: Float[Array, "K 3"]  # (rho, theta, kappa) as the line should appear from there
-    H: Float[Array, "K 2 3"]  # d(rho, theta) / d(line)
+    touched: Bool[Array, "L"]
+    innovation: Float[Array, "L 2"]  # (rho, theta) observed less expected, in the present foot
+    precision: Float[Array, "L 2 2"]  # zero where nothing was seen
+    covariance: Float[Array, "L 2 2"]  # its inverse; zero where nothing was seen
+    expected: Float[Array, "L 3"]  # (rho, theta, kappa) as the line should appear from there
+    H: Float[Array, "L 2 3"]  # d(rho, theta) / d(line)
 
 
-def _measure(rules, sensor, m, sightings, slot, tilt, T_world_foot) -> _Measurement:
-    K = rules.capacity
-    by_line = lambda a: jax.ops.segment_sum(a, slot, K + 1)[:K]
+def _measure(rules, sensor, m, sightings, at, tilt, T_world_foot) -> _Measurement:
+    L = m.updates.shape[0]
+    by_line = lambda a: jax.ops.segment_sum(a, at, L + 1)[:L]
     expected, H = jax.vmap(appear, in_axes=(0, 0, None))(m.line, m.anchor, T_world_foot)
-    at = jnp.minimum(slot, K - 1)
+    of = jnp.minimum(at, L - 1)
     # by the map line's name: a sighting may be named from the other side
-    line, observed = PolarLine(expected[at, 0], expected[at, 1]), sightings.under_tilt(tilt)
+    line, observed = PolarLine(expected[of, 0], expected[of, 1]), sightings.under_tilt(tilt)
     innovation = -polar_difference(line, observed)
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
     wobble = sensor.tilt_sigma**2 * sightings.tilt @ jnp.swapaxes(sightings.tilt, 1, 2)
     noise = rename_covariance(sightings.covariance + TILT_LEFT * wobble, alignment(line, observed))
     precision = inverse_2x2(noise + drift)
-    touched = by_line(jnp.ones(slot.shape)) > 0
+    touched = by_line(jnp.ones(at.shape)) > 0
     total = by_line(precision)
     seen = touched[:, None, None]
     covariance = jnp.where(seen, inverse_2x2(jnp.where(seen, total, jnp.eye(2))), 0)
@@ -92,11 +94,11 @@ def _times(matrix, vector):
 
 def _running_mean(m, seen: _Measurement, T_world_foot):
     """Eq. (14), in the polar form of the moment: rho <- rho gamma + rho' (1 - gamma)."""
-    K = seen.touched.shape[0]
+    L = seen.touched.shape[0]
     gamma = m.updates / (1 + m.updates)
     polar = seen.expected[:, :2] + (1 - gamma)[:, None] * seen.innovation
-    line = jnp.concatenate([polar, jnp.ones((K, 1))], axis=1)
-    here = SE2(jnp.broadcast_to(T_world_foot.xy, (K, 2)), jnp.broadcast_to(T_world_foot.yaw, (K,)))
+    line = jnp.concatenate([polar, jnp.ones((L, 1))], axis=1)
+    here = SE2(jnp.broadcast_to(T_world_foot.xy, (L, 2)), jnp.broadcast_to(T_world_foot.yaw, (L,)))
     return line, m.covariance, here
 
 
@@ -111,10 +113,17 @@ def _kalman(m, seen: _Measurement, T_world_foot):
     return m.line + _times(gain, seen.innovation), covariance, m.anchor
 
 
-def _update(rules, sensor, m, sightings, slot, known, tilt, in_view, T_world_foot):
+def _age(m, sightings):
+    """An image has passed; one without segments changes nothing."""
+    passed = sightings.valid.any().astype(int)
+    resting, unseen = jnp.maximum(m.resting - passed, 0), m.unseen + passed
+    return eqx.tree_at(lambda m: (m.resting, m.unseen), m, (resting, unseen))
+
+
+def _update(rules, sensor, m, sightings, at, known, tilt, in_view, T_world_foot):
     """The known lines move by the rule, and their extents only ever grow."""
-    slot = jnp.where(known & (m.resting[slot] == 0), slot, rules.capacity)  # dropped by scatters
-    seen = _measure(rules, sensor, m, sightings, slot, tilt, T_world_foot)
+    at = jnp.where(known & (m.resting[at] == 0), at, m.updates.shape[0])  # dropped by scatters
+    seen = _measure(rules, sensor, m, sightings, at, tilt, T_world_foot)
     rule = _running_mean if rules.rule == "gamma" else _kalman
     touched = seen.touched
     moved = jax.tree.map(
@@ -122,12 +131,13 @@ def _update(rules, sensor, m, sightings, slot, known, tilt, in_view, T_world_foo
         rule(m, seen, T_world_foot),
         (m.line, m.covariance, m.anchor),
     )
-    endpoints = _extend(rules, *moved, m, sightings, slot, T_world_foot)
+    endpoints = _extend(rules, *moved, m, sightings, at, T_world_foot)
     endpoints = jnp.where(touched[:, None, None], endpoints, m.segments_world.endpoints)
     grown = (safe_norm(endpoints[:, 1] - endpoints[:, 0]) > rules.length) & (
         m.segments_world.length <= rules.length
     )
-    passed = sightings.valid.any().astype(int)  # an image without segments changes nothing
+    passed = sightings.valid.any().astype(int)
+    aged = _age(m, sightings)
     line, covariance, anchor = moved
     return SegmentMap(
         segments_world=Segments(endpoints, m.valid),
@@ -135,8 +145,8 @@ def _update(rules, sensor, m, sightings, slot, known, tilt, in_view, T_world_foo
         line=line,
         covariance=covariance,
         updates=m.updates + touched.astype(int),
-        resting=jnp.where(touched & grown, rules.rest, jnp.maximum(m.resting - passed, 0)),
-        unseen=jnp.where(touched, 0, m.unseen + passed),
+        resting=jnp.where(touched & grown, rules.rest, aged.resting),
+        unseen=jnp.where(touched, 0, aged.unseen),
         expected=m.expected + passed * (m.valid & (in_view | touched)).astype(int),
     )
 
@@ -150,9 +160,9 @@ def _within(endpoints_foot, radius):
     return line.rho * n + along[:, None] * d, (half > 0) & (along[0] != along[1])
 
 
-def _extend(rules, line, covariance, anchor, m, sightings, slot, T_world_foot):
+def _extend(rules, line, covariance, anchor, m, sightings, at, T_world_foot):
     """End points on the updated lines, grown by what was seen within R, never shrunk."""
-    K = rules.capacity
+    L = m.updates.shape[0]
     line, _ = jax.vmap(believed, in_axes=(None, 0, 0))(rules, line, covariance)
     polar = PolarLine(line[:, 0] / line[:, 2], line[:, 1])  # the line itself, not its apparition
     n, d = normal(polar), direction(polar)
@@ -160,16 +170,16 @@ def _extend(rules, line, covariance, anchor, m, sightings, slot, T_world_foot):
     old = jax.vmap(SE2.apply)(T_anchor_world, m.segments_world.endpoints)
     along = jnp.einsum("kij,kj->ki", old, d)
 
-    at = jnp.minimum(slot, K - 1)
+    of = jnp.minimum(at, L - 1)
     near, some = jax.vmap(_within, in_axes=(0, None))(sightings.endpoints_foot, rules.range)
     T_anchor_foot = jax.vmap(lambda T: T @ T_world_foot)(
-        jax.tree.map(lambda a: a[at], T_anchor_world)
+        jax.tree.map(lambda a: a[of], T_anchor_world)
     )
-    points = jax.vmap(SE2.apply)(T_anchor_foot, near / line[at, 2, None, None])
-    t = jnp.einsum("mij,mj->mi", points, d[at])
-    slot = jnp.where(some, slot, K)
-    low = jnp.minimum(along.min(axis=1), jax.ops.segment_min(t.min(axis=1), slot, K + 1)[:K])
-    high = jnp.maximum(along.max(axis=1), jax.ops.segment_max(t.max(axis=1), slot, K + 1)[:K])
+    points = jax.vmap(SE2.apply)(T_anchor_foot, near / line[of, 2, None, None])
+    t = jnp.einsum("mij,mj->mi", points, d[of])
+    at = jnp.where(some, at, L)
+    low = jnp.minimum(along.min(axis=1), jax.ops.segment_min(t.min(axis=1), at, L + 1)[:L])
+    high = jnp.maximum(along.max(axis=1), jax.ops.segment_max(t.max(axis=1), at, L + 1)[:L])
     ends = polar.rho[:, None, None] * n[:, None] + jnp.stack([low, high], 1)[..., None] * d[:, None]
     return jax.vmap(SE2.apply)(anchor, ends)
 
@@ -200,23 +210,23 @@ def _insert(rules, m, sightings, new, tilt, T_world_foot):
     ), overflow
 
 
-def _merge(rules, m, slot, known):
+def _merge(rules, m, at, known):
     """A line just seen joins an older one that it doubles: the older one's place, both extents."""
-    K = rules.capacity
-    at = jnp.minimum(slot, K - 1)
+    L = m.updates.shape[0]
     ends = m.segments_world.endpoints
     line = jax.vmap(polar_through)(ends)
     n = normal(line)
     raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
 
-    first, second = jnp.einsum("mij,kj->imk", ends[at], n) - line.rho
+    mine = ends[at][:, None]
+    off = lambda x: jnp.abs(x[..., 0] * n[:, 0] + x[..., 1] * n[:, 1] - line.rho)
     turn = (wrap if rules.directed else wrap_axial)(line.theta[at][:, None] - line.theta)
-    gap = -jax.vmap(jax.vmap(overlap, in_axes=(None, 0)), in_axes=(0, None))(ends[at], ends)
+    gap = -overlap(mine, ends)
     older = (m.updates > m.updates[at][:, None]) | (
-        (m.updates == m.updates[at][:, None]) & (jnp.arange(K) < at[:, None])
+        (m.updates == m.updates[at][:, None]) & (jnp.arange(L) < at[:, None])
     )
     double = (
-        (jnp.maximum(jnp.abs(first), jnp.abs(second)) < rules.merge_distance)
+        (jnp.maximum(off(mine[:, :, 0]), off(mine[:, :, 1])) < rules.merge_distance)
         & (jnp.abs(turn) < rules.merge_angle)
         & (gap < rules.join_gap)
         & (raised == raised[at][:, None])
@@ -224,21 +234,22 @@ def _merge(rules, m, slot, known):
         & m.valid
         & (known & m.valid[at])[:, None]
     )
-    into = jnp.where(double, jnp.arange(K), K - 1).min(axis=1)  # the first of them
-    dying = jnp.zeros(K, bool).at[at].max(double.any(axis=1))
-    joins = double.any(axis=1) & ~dying[into]
+    into = jnp.where(double, jnp.arange(L), L).min(axis=1)  # the first of them; read but once
+    doubles, first = into < L, jnp.minimum(into, L - 1)
+    dying = jnp.zeros(L, bool).at[at].max(doubles)
+    joins = doubles & ~dying[first]
 
     d = direction(line)
     along = jnp.einsum("kij,kj->ki", ends, d)
-    t = jnp.einsum("mij,mj->mi", ends[at], d[into])
-    into = jnp.where(joins, into, K)
+    t = jnp.einsum("mij,mj->mi", ends[at], d[first])
+    into = jnp.where(joins, into, L)
     low = along.min(axis=1).at[into].min(t.min(axis=1), mode="drop")
     high = along.max(axis=1).at[into].max(t.max(axis=1), mode="drop")
     joined = (
         line.rho[:, None, None] * n[:, None] + jnp.stack([low, high], 1)[..., None] * d[:, None]
     )
-    grew = jnp.zeros(K, bool).at[into].set(True, mode="drop")
-    gone = jnp.zeros(K, bool).at[jnp.where(joins, at, K)].set(True, mode="drop")
+    grew = jnp.zeros(L, bool).at[into].set(True, mode="drop")
+    gone = jnp.zeros(L, bool).at[jnp.where(joins, at, L)].set(True, mode="drop")
     segments = Segments(jnp.where(grew[:, None, None], joined, ends), m.valid & ~gone)
     return eqx.tree_at(lambda m: m.segments_world, m, segments)
 

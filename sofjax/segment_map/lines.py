@@ -20,6 +20,7 @@ class MapRules(eqx.Module):
     classify: bool = eqx.field(static=True, default=True)  # estimate kappa, tell floor from above
     directed: bool = eqx.field(static=True, default=False)  # tell a line's edges apart
     capacity: int = eqx.field(static=True, default=1024)  # K
+    nearby: int = eqx.field(static=True, default=256)  # L, map lines that an image may show
     candidates: int = eqx.field(static=True, default=4)  # C, map lines compared per sighting
     range: float = 5.0  # R, metres: what is farther does not extend a segment
     length: float = 10.0  # L = 2 R, metres: a longer segment rests
@@ -54,6 +55,16 @@ class SegmentMap(eqx.Module):
     @property
     def valid(self) -> Bool[Array, "K"]:
         return self.segments_world.valid
+
+    def take(self, slots: Int[Array, "L"]) -> "SegmentMap":
+        """A map of these slots; K stands for none."""
+        there = slots < self.updates.shape[0]
+        some = jax.tree.map(lambda a: a.at[slots].get(mode="clip"), self)
+        return eqx.tree_at(lambda m: m.segments_world.valid, some, some.valid & there)
+
+    def put(self, slots: Int[Array, "L"], some: "SegmentMap") -> "SegmentMap":
+        """The map with `some` back in the slots that they were taken from."""
+        return jax.tree.map(lambda a, b: a.at[slots].set(b, mode="drop"), self, some)
 
 
 def empty_map(rules: MapRules) -> SegmentMap:
@@ -105,6 +116,41 @@ def appear(
     zero, one = jnp.zeros_like(rho), jnp.ones_like(rho)
     H = jnp.stack([jnp.stack([one, line[2] * along, -across]), jnp.stack([zero, one, zero])])
     return jnp.stack([rho, line[1] - T_anchor_foot.yaw, line[2]]), H
+
+
+RUNGS = 16  # radii to choose from where there are more lines than an image may show
+
+
+def nearby(
+    rules: MapRules, segment_map: SegmentMap, T_world_foot: SE2, reach: Float[Array, ""]
+) -> tuple[Int[Array, "L"], Int[Array, ""]]:
+    """The slots of the lines nearest to a foot: the one pass over the whole map in a step.
+
+    All lines if there are no more than L; else those within a radius of which there are so many,
+    which leaves nothing out that can be seen as long as it is not less than `reach`.
+
+    **Arguments:**
+    - `reach`: metres that the farthest point seen, and what may match it, is away.
+
+    **Returns:** the slots in ascending order, K for none; and how many lines within `reach` are
+    not among them.
+    """
+    K = segment_map.updates.shape[0]
+    L = min(rules.nearby, K)
+    ends = segment_map.segments_world.endpoints - T_world_foot.xy
+    x, y = ends[:, 0, 0], ends[:, 0, 1]
+    u, v = ends[:, 1, 0] - x, ends[:, 1, 1] - y
+    share = jnp.clip(-(x * u + y * v) / jnp.maximum(u * u + v * v, 1e-12), 0, 1)
+    # a raised line is seen magnified about the foot
+    distance2 = ((x + share * u) ** 2 + (y + share * v) ** 2) * segment_map.line[:, 2] ** 2
+    distance2 = jnp.where(segment_map.valid, distance2, jnp.inf)
+    radii = jnp.append(reach * jnp.arange(1, RUNGS + 1, dtype=float) / RUNGS, jnp.inf)
+    counts = jnp.sum(distance2 < radii[:, None] ** 2, axis=1)
+    radius = jnp.max(jnp.where(counts <= L, radii, 0))
+    near = distance2 < radius**2
+    place = jnp.where(near, jnp.cumsum(near) - 1, L)
+    slots = jnp.full(L, K).at[place].set(jnp.arange(K), mode="drop")
+    return slots, counts[RUNGS - 1] - jnp.minimum(near.sum(), counts[RUNGS - 1])
 
 
 def in_view(
