@@ -8,6 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from sofjax.calibration.pairs import (
+    TURNS,
     UNKNOWNS,
     Pairs,
     U,
@@ -192,7 +193,7 @@ def verdict(found: CalibrationResult, rules: FitRules, pairs: Pairs) -> tuple[bo
     wide = [
         f"the {_ERRORS.get(name, name)} ({_amount(name, float(s))})"
         for name, s, most in zip(UNKNOWNS, sigma, limit, strict=True)
-        if name in rules.free and s > most
+        if name in rules.free and name not in TURNS and s > most  # nobody asked for the turns
     ]
     if wide:
         doubt = doubts(found)
@@ -204,10 +205,11 @@ def verdict(found: CalibrationResult, rules: FitRules, pairs: Pairs) -> tuple[bo
 
 def doubts(found: CalibrationResult) -> str:
     """What speaks against a fit that converged, in words; empty if nothing."""
-    if found.surprise < DOUBT:
+    surprise = float(found.surprise)
+    if surprise < DOUBT:
         return ""
     return (
-        f"it takes an odometer {float(found.surprise):.1f} times further off than odometers are, "
+        f"it takes an odometer {surprise:.1f} times further off than odometers are, "
         "so camera, clock or odometer are not what they are taken for, and the errors told are "
         "wider by as much"
     )
