@@ -21,8 +21,9 @@ from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
 from sofjax.smoothing.merging import doubles, representatives
 from sofjax.smoothing.pieces import Pieces, cut
 from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, misfit
-from sofjax.smoothing.solution import Solution, solve
+from sofjax.smoothing.solution import TOLERANCE, Solution, solve
 
+ROUGH = 2e-3  # metres and radians to which poses settle in rounds that are not the last
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
 
 
@@ -110,14 +111,17 @@ def smooth(
         for left in reversed(range(rules.rounds)):
             problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
             pieces = _cut(problem, pieces)
-            problem, lines, solution = _solved(config, problem, lines, pieces)
+            tolerance = ROUGH if left else TOLERANCE
+            problem, lines, solution = _solved(config, problem, lines, pieces, tolerance)
             costs.append((float(solution.cost_before), float(solution.cost)))
             into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
             if joins.any():
                 merged += int(joins.sum())
                 problem, lines = _renamed(problem, lines, representatives(into, joins))
                 pieces = _cut(problem, pieces)
-                problem, lines, solution = _solved(config, problem, lines, pieces, left == 0)
+                problem, lines, solution = _solved(
+                    config, problem, lines, pieces, tolerance, sure=left == 0
+                )
                 costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
         return jax.device_get(
@@ -209,10 +213,10 @@ def _cut(problem: Problem, before: Pieces | None) -> Pieces:
     return cut(problem.keyframes, problem.start.line.shape[0], room=room)
 
 
-def _solved(config: SlamConfig, problem: Problem, lines: Lines, pieces: Pieces, sure=True):
+def _solved(config, problem: Problem, lines: Lines, pieces: Pieces, tolerance: float, sure=True):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
-    solution = solve(problem, pieces, sure=sure)
+    solution = solve(problem, pieces, sure=sure, tolerance=tolerance)
     return *_settled(config, problem, lines, solution), solution
 
 

@@ -12,7 +12,7 @@ from sofjax.smoothing.marginals import Marginals, marginals
 from sofjax.smoothing.pieces import Pieces, PiecewiseSolver, cut, reduce
 from sofjax.smoothing.problem import Problem, Residuals, Unknowns, residuals
 
-TOLERANCE = 1e-4  # metres and radians, of the last step of any pose
+TOLERANCE = 1e-4  # metres and radians
 MISFIT = 1e-3  # standard deviations, root mean square, by which it changes the residuals
 
 
@@ -48,27 +48,38 @@ def _cost(r: Residuals) -> Float[Array, ""]:
 
 
 def solve(
-    problem: Problem, pieces: Pieces | None = None, max_steps: int = 60, sure: bool = True
+    problem: Problem,
+    pieces: Pieces | None = None,
+    max_steps: int = 60,
+    sure: bool = True,
+    tolerance: float = TOLERANCE,
 ) -> Solution:
     """Levenberg-Marquardt from `problem.start`. Expects float64; see `jax.enable_x64`.
 
     **Arguments:**
     - `pieces`: of `cut`, which is asked if they are not given; it needs numbers, not tracers.
     - `sure`: whether the covariances are wanted; they cost as much as some steps.
+    - `tolerance`: metres and radians, of the last step of any pose.
 
     **Returns:** the estimate with marginal covariances, or zeros for them. `converged` is false
     where `max_steps` did not suffice; the estimate is then the best so far.
     """
     if pieces is None:
         pieces = cut(problem.keyframes, problem.start.line.shape[0])
-    return _solve(problem, pieces, max_steps, jnp.asarray(sure))
+    return _solve(problem, pieces, max_steps, jnp.asarray(sure), jnp.asarray(tolerance))
 
 
 @eqx.filter_jit
-def _solve(problem: Problem, pieces: Pieces, max_steps: int, sure: Bool[Array, ""]) -> Solution:
+def _solve(
+    problem: Problem,
+    pieces: Pieces,
+    max_steps: int,
+    sure: Bool[Array, ""],
+    tolerance: Float[Array, ""],
+) -> Solution:
     solver = optx.LevenbergMarquardt(
-        rtol=TOLERANCE,
-        atol=TOLERANCE,
+        rtol=tolerance,
+        atol=tolerance,
         norm=_norm,
         linear_solver=PiecewiseSolver(problem.keyframes, pieces),
     )
