@@ -1,4 +1,4 @@
-"""The smoother's pieces against dense algebra, and its solution against a known world."""
+"""The smoother's elimination against dense algebra, and its solution against a known world."""
 
 import equinox as eqx
 import jax
@@ -12,13 +12,15 @@ from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floo
 from sofjax.motion import MotionModel
 from sofjax.smoothing import Keyframes, Priors, Problem, Unknowns, residuals, solve
 from sofjax.smoothing.blocks import Jacobian
+from sofjax.smoothing.dissection import dissect, divide
+from sofjax.smoothing.elimination import eliminate
 from sofjax.smoothing.marginals import marginals
-from sofjax.smoothing.pieces import cut, reduce
 
 pytestmark = pytest.mark.slow  # compiles in double precision, minutes on a busy machine
 
 N, K = 6, 7
-PIECES = lambda problem: cut(problem.keyframes, K, length=3)
+LEAVES = [0, 0, 0, 1, 1, 2]
+CUT = lambda problem: dissect(problem.keyframes, K, np.array(LEAVES))
 
 
 @pytest.fixture(scope="module")
@@ -122,25 +124,43 @@ def test_the_jacobian_transposed_is_the_gradient_of_half_the_squares(problem):
         np.testing.assert_allclose(sighted, want, rtol=1e-9, atol=1e-9 * np.abs(want).max())
 
 
-def test_pieces_have_the_lines_for_themselves_that_no_other_sees(problem):
+def test_keyframes_of_one_place_are_of_one_leaf_however_often_it_is_passed(rng):
+    lap = np.stack([np.linspace(0, 60, 200), np.zeros(200)], axis=1)
+    xy = np.concatenate([lap, lap[::-1], lap]) + rng.normal(0, 0.01, (600, 2))
+    leaf = divide(xy)
+    assert leaf.max() == 15
+    assert np.bincount(leaf).max() <= 48
+    for i in range(16):
+        assert np.ptp(xy[leaf == i, 0]) < 60 / 16 + 0.5
+
+
+def test_unknowns_are_eliminated_under_all_that_know_them(problem):
     problem, _ = problem
     frames = problem.keyframes
     known = jnp.zeros((N, K), bool).at[0, 1].set(True).at[1, 4].set(True).at[4, 4].set(True)
     frames = eqx.tree_at(lambda f: f.known, frames, known.at[5, 6].set(True))
-    pieces = cut(frames, K, length=3)
-    own = [sorted(int(k) for k in row if k < K) for row in pieces.own]
-    assert 1 in own[0]
-    assert 6 in own[1]
-    assert sorted(own[0] + own[1]) == [0, 1, 2, 3, 5, 6]
-    assert [int(k) for k in pieces.left if k < K] == [4]
-    P = pieces.own.shape[1]
-    assert pieces.slot[1, 4] == pieces.slot[4, 4] == P  # the first of those left over, for both
-    assert pieces.own[0, pieces.slot[0, 1]] == 1
-    assert (np.asarray(pieces.slot)[~known] <= P + pieces.border.shape[1]).all()
+    found = dissect(frames, K, np.array(LEAVES))
+    low, root = found.generations
+    unknown = lambda k: 5 * N + 3 * k
+    assert unknown(1) in low.own[0]
+    assert unknown(6) in low.own[2]
+    assert unknown(4) in low.border[0]
+    assert unknown(4) in low.border[1]
+    assert unknown(4) in root.own[0]
+    assert 5 * 2 in root.own[0]  # the last pose of the first leaf, known to the next
+    assert 5 * 0 in low.own[0]
+    each = np.concatenate([np.asarray(g.own).ravel() for g in found.generations])
+    assert sorted(each[each < found.size]) == list(range(found.size))  # each of them once
+    here = np.asarray(low.border[1])
+    above = np.asarray(low.above[1])
+    real = here < found.size
+    np.testing.assert_array_equal(np.asarray(root.own[0])[above[real]], here[real])
 
 
-@pytest.mark.parametrize("length", [2, 3, 6])
-def test_a_step_by_pieces_solves_the_dense_equations(problem, length):
+@pytest.mark.parametrize(
+    "leaves", [[0] * 6, LEAVES, [0, 1, 2, 3, 1, 0], [0, 0, 5, 6, 9, 15]], ids=str
+)
+def test_a_step_by_dissection_solves_the_dense_equations(problem, leaves):
     problem, _ = problem
     with jax.enable_x64(True):
         # the first lines are seen by all, the next by the first half, the last by the second
@@ -149,23 +169,23 @@ def test_a_step_by_pieces_solves_the_dense_equations(problem, length):
         u = problem.start
         _, jvp = jax.linearize(lambda v: residuals(v, problem), u)
         blocks = Jacobian.of(jvp, u).blocks(problem.keyframes, 1.0)
-        pieces = cut(problem.keyframes, K, length)
-        reduced = jax.jit(reduce)(blocks, pieces)
+        dissection = dissect(problem.keyframes, K, np.array(leaves))
+        factors = jax.jit(eliminate)(blocks, dissection)
         rng = np.random.default_rng(1)
         right = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=a.shape)), u)
-        got, _ = jax.flatten_util.ravel_pytree(reduced.solve(right))
+        got, _ = jax.flatten_util.ravel_pytree(factors.solve(right))
         dense = _dense(problem, u) + np.eye(5 * N + 3 * K + 8)
         want = np.linalg.solve(dense, jax.flatten_util.ravel_pytree(right)[0])
         np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
 
         inverse = np.linalg.inv(dense)
-        found = jax.jit(marginals)(reduced)
+        found = jax.jit(marginals)(factors)
         P = 5 * N
         for i in range(N):
             at = slice(5 * i, 5 * i + 5)
             np.testing.assert_allclose(found.pose[i], inverse[at, at], rtol=1e-6, atol=1e-12)
         i, j = (v.ravel() for v in np.mgrid[:K, :K])
-        pairs = found.of_lines(jnp.asarray(i), jnp.asarray(j), K)
+        pairs = found.of_lines(jnp.asarray(i), jnp.asarray(j))
         want = inverse[P : P + 3 * K, P : P + 3 * K].reshape(K, 3, K, 3)[i, :, j, :]
         np.testing.assert_allclose(pairs, want, rtol=1e-6, atol=1e-12)
         np.testing.assert_allclose(found.shared, inverse[-8:, -8:], rtol=1e-6, atol=1e-12)
@@ -174,7 +194,7 @@ def test_a_step_by_pieces_solves_the_dense_equations(problem, length):
 def test_solution_is_that_of_a_dense_solver_and_finds_the_path(problem):
     problem, pose = problem
     with jax.enable_x64(True):
-        ours = solve(problem, PIECES(problem))
+        ours = solve(problem, CUT(problem))
         assert bool(ours.converged)
         np.testing.assert_allclose(ours.unknowns.pose[:, :3], pose[:, :3], atol=5e-3)
         solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
@@ -186,14 +206,14 @@ def test_solution_is_that_of_a_dense_solver_and_finds_the_path(problem):
 def test_marginal_covariances_are_those_of_the_dense_inverse(problem):
     problem, _ = problem
     with jax.enable_x64(True):
-        ours = solve(problem, PIECES(problem))
+        ours = solve(problem, CUT(problem))
         scale = np.linalg.inv(_dense(problem, ours.unknowns))
         for i in range(N):
             want = scale[5 * i : 5 * i + 5, 5 * i : 5 * i + 5]
             np.testing.assert_allclose(ours.pose_covariance[i], want, rtol=1e-4, atol=1e-12)
         k, two = 5 * N + 3 * 2, jnp.array([2])
         np.testing.assert_allclose(
-            ours.marginals.of_lines(two, two, K)[0],
+            ours.marginals.of_lines(two, two)[0],
             scale[k : k + 3, k : k + 3],
             rtol=1e-4,
             atol=1e-12,
@@ -204,6 +224,6 @@ def test_a_drive_without_one_known_segment_follows_the_odometer(problem):
     problem, pose = problem
     with jax.enable_x64(True):
         blind = eqx.tree_at(lambda p: p.keyframes.known, problem, jnp.zeros((N, K), bool))
-        found = solve(blind, PIECES(blind))
+        found = solve(blind, CUT(blind))
         assert bool(jnp.isfinite(found.unknowns.pose).all())
         np.testing.assert_allclose(found.unknowns.pose[:, :3], pose[:, :3] + 0, atol=1e-3)

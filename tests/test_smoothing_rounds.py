@@ -13,10 +13,11 @@ from sofjax.segment_map import MapRules, empty_map
 from sofjax.slam import SlamConfig
 from sofjax.smoothing import Keyframes, Path, Seeing, SmoothingRules, Unknowns, rounds, smooth
 from sofjax.smoothing import keyframes as kf
+from sofjax.smoothing.dissection import dissect
+from sofjax.smoothing.elimination import Factors
 from sofjax.smoothing.lines import associate, lines_of
 from sofjax.smoothing.marginals import Marginals
 from sofjax.smoothing.merging import doubles, representatives
-from sofjax.smoothing.pieces import Pieces
 from sofjax.smoothing.solution import solve
 
 
@@ -132,12 +133,18 @@ def test_lines_are_one_where_what_is_known_of_both_together_allows_it(
 
 
 def known(joint):
-    """Marginals of two lines that are left over between pieces that see nothing else."""
-    pieces = Pieces(jnp.full((1, 1), 2), jnp.arange(2), jnp.arange(2)[None], jnp.zeros((2, 1), int))
-    rest = jnp.zeros((19, 19)).at[5:11, 5:11].set(joint.reshape(6, 6))
-    return Marginals(
-        pieces, rest, jnp.zeros((1, 1, 3, 24)), jnp.zeros((1, 1, 3, 1, 3)), jnp.zeros((2, 5, 5))
-    )
+    """Marginals of two lines that the only leaf eliminates, after the pose of its keyframe."""
+    none = jnp.zeros((1, 1), int)
+    frames = Keyframes(
+        Segments(jnp.zeros((1, 1, 2, 2)), none > 0), none, none > 0,
+        SE2(jnp.zeros((1, 2)), jnp.zeros(1)), jnp.zeros((1, 3)),
+    )  # fmt: skip
+    dissection = dissect(frames, 2, np.zeros(1, int))
+    (only,) = dissection.generations
+    a, q = only.own.shape[1], only.border.shape[1]
+    within = jnp.zeros((1, a + q, a + q)).at[0, 5:11, 5:11].set(joint.reshape(6, 6))
+    factors = Factors(dissection, (jnp.zeros((1, a, a)),), (jnp.zeros((1, a, q)),))
+    return Marginals(factors, (within,), jnp.zeros((1, 5, 5)))
 
 
 def test_names_are_handed_on_to_the_end():
@@ -184,9 +191,9 @@ def test_rounds_find_the_path_that_the_odometer_misread(rng, monkeypatch):
     path = Path(online, jnp.zeros((41, 2)), jnp.zeros(4))
     kinds = set()
 
-    def solve_of_one_kind(problem, pieces, **how):
-        kinds.add(str(jax.eval_shape(lambda *a: a, problem, pieces)))
-        return solve(problem, pieces, **how)
+    def solve_of_one_kind(problem, dissection, **how):
+        kinds.add(str(jax.eval_shape(lambda *a: a, problem, dissection)))
+        return solve(problem, dissection, **how)
 
     monkeypatch.setattr(rounds, "solve", solve_of_one_kind)
     done = smooth(SlamConfig(), CAMERA, MOUNT, log, path, m, SmoothingRules(rounds=2))

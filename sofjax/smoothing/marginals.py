@@ -1,80 +1,98 @@
 """How sure a solution is: covariances of its poses and lines, and of two lines with each other."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
+from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, Int
 
-from sofjax.smoothing.pieces import Pieces, Reduced
+from sofjax.smoothing.dissection import BRANCH
+from sofjax.smoothing.elimination import Factors
 from sofjax.smoothing.problem import LINE, POSE, SHARED
 
 
 class Marginals(eqx.Module):
     """Parts of the inverse of the normal equations."""
 
-    pieces: Pieces
-    rest: Float[Array, "B B"]  # of what is left over
-    ties: Float[Array, "C P 3 q"]  # of the pieces' own lines
-    own: Float[Array, "C P 3 P 3"]  # what they would have if all that they border on were known
+    factors: Factors
+    within: tuple[Float[Array, "_ _ _"], ...]  # [N, a + q, a + q] of (own, border), by generation
     pose: Float[Array, "n 5 5"]
 
     @property
     def shared(self) -> Float[Array, "8 8"]:
-        return self.rest[-SHARED:, -SHARED:]
+        d = self.factors.dissection
+        at = jnp.searchsorted(d.generations[-1].own[0], d.size - SHARED)  # the root's last
+        return jax.lax.dynamic_slice(self.within[-1][0], (at, at), (SHARED, SHARED))
 
-    def of_lines(
-        self, i: Int[Array, "pairs"], j: Int[Array, "pairs"], K: int
-    ) -> Float[Array, "pairs 3 3"]:
-        """Between lines i and j, each of K."""
-        pieces, B = self.pieces, self.rest.shape[0]
-        C, P = pieces.own.shape
-        L, q = pieces.left.shape[0], self.ties.shape[-1]
-        table = lambda value, at, none: jnp.full(K + 1, none).at[at].set(value)[:K]
-        home = table(jnp.arange(C * P).reshape(C, P), pieces.own, -1)
-        place = table(jnp.arange(L), pieces.left, 0)
-        places, R = pieces.places, jnp.pad(self.rest, (0, 1))
-        itself = jnp.zeros((LINE, q)).at[jnp.arange(LINE), jnp.arange(LINE)].set(1)
+    def of_lines(self, i: Int[Array, "pairs"], j: Int[Array, "pairs"]) -> Float[Array, "pairs 3 3"]:
+        """Between lines i and j.
 
-        def follows(k):
-            """Rows by which a line follows what is left over, and the places of that."""
-            piece, p = jnp.divmod(jnp.maximum(home[k], 0), P)
-            at = jnp.full(q, B).at[:LINE].set(POSE * C + LINE * place[k] + jnp.arange(LINE))
-            mine = home[k] >= 0
-            return jnp.where(mine, -self.ties[piece, p], itself), jnp.where(
-                mine, places[piece], at
-            ), mine, piece, p  # fmt: skip
+        Each is followed up the tree, as a combination of what ever higher nodes border on, to the
+        lowest node above both.
+        """
+        d = self.factors.dissection
+        leaf, place = d.line
+        start = jnp.zeros((LINE, self.within[0].shape[1]))
+        itself = lambda k: start.at[:, place[k] + jnp.arange(LINE)].set(jnp.eye(LINE))
 
         def of_pair(pair):
-            (F, at, mine, piece, p), (G, there, yours, other, r) = map(follows, pair)
-            together = F @ R[at[:, None], there[None, :]] @ G.T
-            same = mine & yours & (piece == other)
-            return together + jnp.where(same, self.own[piece, p, :, r, :], 0)
+            rows, nodes = [itself(k) for k in pair], [leaf[k] for k in pair]
+            found, met = jnp.zeros((LINE, LINE)), jnp.array(False)
+            for height in range(len(d.generations)):
+                meet = (nodes[0] == nodes[1]) & ~met
+                between = partial(_between, self.within[height])
+                found = jax.lax.cond(meet, between, lambda *same: same[-1], *rows, nodes[0], found)
+                met = met | meet
+                if height + 1 < len(d.generations):
+                    rows = [
+                        self._lifted(height, row, k, met)
+                        for row, k in zip(rows, nodes, strict=True)
+                    ]
+                    nodes = [k // BRANCH for k in nodes]
+            return found
 
-        return jax.lax.map(of_pair, (i, j), batch_size=16)
+        return jax.lax.map(of_pair, (i, j))
+
+    def _lifted(self, height, row, node, useless):
+        """A combination of what a node knows as one of what its parent knows, if that is of use."""
+        above = self.factors.dissection.generations[height].above
+        factor, ties = self.factors.factor[height], self.factors.ties[height]
+        none, a = jnp.zeros((LINE, self.within[height + 1].shape[1])), ties.shape[1]
+
+        def lifted(row, k):
+            follows = solve_triangular(factor[k], row[:, :a].T, lower=True).T @ ties[k]
+            border = row[:, a:] - follows
+            return none.at[:, above[k]].add(border, mode="drop")
+
+        return jax.lax.cond(useless, lambda *_: none, lifted, row, node)
 
 
-def marginals(reduced: Reduced) -> Marginals:
-    pieces, B = reduced.pieces, reduced.pieces.size
-    C, P, c = *pieces.own.shape, pieces.length
-    a = POSE * (c - 1)
-    rest = cho_solve((reduced.rest, True), jnp.eye(B))
-    R = jnp.pad(rest, (0, 1))
-    k = jnp.arange(c - 1)
+def _between(within, first, second, node, _):
+    return first @ within[node] @ second.T
 
-    def of_piece(each):
-        factor, ties, places = each
-        alone = cho_solve((factor, True), jnp.eye(len(factor)))
-        poses = ties[:a] @ R[places[:, None], places[None, :]] @ ties[:a].T + alone[:a, :a]
-        blocks = poses.reshape(c - 1, POSE, c - 1, POSE)[k, :, k, :]
-        first = R[places[:POSE, None], places[None, :POSE]]
-        return jnp.concatenate([first[None], blocks]), alone[a:, a:]
 
-    pose, own = jax.lax.map(of_piece, (reduced.factor, reduced.ties, pieces.places))
-    return Marginals(
-        pieces,
-        rest,
-        reduced.ties[:, a:].reshape(C, P, LINE, -1),
-        own.reshape(C, P, LINE, P, LINE),
-        pose.reshape(-1, POSE, POSE),
-    )
+def marginals(factors: Factors) -> Marginals:
+    """From the root, whose unknowns have no border, down to the leaves."""
+    d, within = factors.dissection, []
+    parents = jnp.zeros((1, 0, 0))
+    for generation, factor, ties in reversed(
+        list(zip(d.generations, factors.factor, factors.ties, strict=True))
+    ):
+
+        def of_node(each, parents=parents):
+            L, E, above, node = each
+            parent = jnp.pad(parents[node // BRANCH], (0, 1))
+            at = jnp.minimum(above, parent.shape[0] - 1)
+            border = parent[at][:, at]
+            follows = solve_triangular(L, E, lower=True, trans=1)
+            to_border = -follows @ border
+            own = cho_solve((L, True), jnp.eye(L.shape[0])) - to_border @ follows.T
+            return jnp.block([[own, to_border], [to_border.T, border]])
+
+        parents = jax.lax.map(of_node, (factor, ties, generation.above, jnp.arange(len(factor))))
+        within.insert(0, parents)
+    leaf, at = d.pose
+    of_pose = lambda k, at: jax.lax.dynamic_slice(within[0][k], (at, at), (POSE, POSE))
+    return Marginals(factors, tuple(within), jax.lax.map(lambda a: of_pose(*a), (leaf, at)))

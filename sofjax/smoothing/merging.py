@@ -9,7 +9,6 @@ from sofjax.geometry.lines import PolarLine, alignment, polar_difference
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
 from sofjax.segment_map import appear
-from sofjax.smoothing.keyframes import padded
 from sofjax.smoothing.lines import Lines
 from sofjax.smoothing.marginals import Marginals
 
@@ -18,6 +17,7 @@ REACH, TURN = 0.25, 0.25  # metres, radians: beyond this what is likest may be a
 MODEL = (0.004, 0.01, 0.02)  # metres, radians, kappa: what no covariance knows of
 LEAST = 3  # sightings: of what is hardly seen all is possible
 GAP = 0.3  # metres between two pieces of one line
+PAIRS = 256  # compared in one call, however many there are
 
 
 def doubles(
@@ -35,8 +35,9 @@ def doubles(
     i, j = np.nonzero(np.asarray(_near(lines, sightings)))
     into, least = np.zeros(K, int), np.full(K, np.inf)
     if len(i):
-        room = np.zeros(padded(len(i)) - len(i), int)
-        error = np.asarray(_errors(lines, marginals, np.append(i, room), np.append(j, room)))
+        room = np.zeros(-len(i) % PAIRS, int)
+        pairs = np.stack([np.append(i, room), np.append(j, room)], axis=1).reshape(-1, PAIRS, 2)
+        error = np.concatenate([_errors(lines, marginals, *some.T) for some in pairs])
         for a, b, e in zip(i, j, error, strict=False):
             if e < min(GATE**2, least[b]):
                 into[b], least[b] = a, e
@@ -90,7 +91,7 @@ def _errors(
     lines: Lines, marginals: Marginals, i: Int[Array, "pairs"], j: Int[Array, "pairs"]
 ) -> Float[Array, "pairs"]:
     """Squared difference of the two, in units of its covariance."""
-    K, ends = lines.valid.shape[0], lines.endpoints_world
+    ends = lines.endpoints_world
     model = jnp.diag(jnp.array(MODEL, lines.line.dtype) ** 2)
 
     def of_pair(i, j, own_i, own_j, both):
@@ -103,7 +104,7 @@ def _errors(
         return d @ jnp.linalg.solve(S, d)
 
     of = marginals.of_lines
-    return jax.vmap(of_pair)(i, j, of(i, i, K), of(j, j, K), of(i, j, K))
+    return jax.vmap(of_pair)(i, j, of(i, i), of(j, j), of(i, j))
 
 
 def representatives(into: np.ndarray, joins: np.ndarray) -> np.ndarray:

@@ -16,10 +16,10 @@ from sofjax.observation import Observation
 from sofjax.segment_map import MapRules, SegmentMap, is_raised
 from sofjax.slam import FinalMap, SlamConfig
 from sofjax.smoothing import keyframes as kf
+from sofjax.smoothing.dissection import Dissection, dissect, divide
 from sofjax.smoothing.extents import reaches
 from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
 from sofjax.smoothing.merging import doubles, representatives
-from sofjax.smoothing.pieces import Pieces, cut
 from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, misfit
 from sofjax.smoothing.solution import TOLERANCE, Solution, solve
 
@@ -107,20 +107,21 @@ def smooth(
             lines.raised,
             start,
         )
-        costs, merged, pieces = [], 0, None
+        costs, merged, dissection = [], 0, None
+        leaf = divide(np.asarray(start.pose[:, :2]))
         for left in reversed(range(rules.rounds)):
             problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
-            pieces = _cut(problem, pieces)
+            dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
             tolerance = ROUGH if left else TOLERANCE
-            problem, lines, solution = _solved(config, problem, lines, pieces, tolerance)
+            problem, lines, solution = _solved(config, problem, lines, dissection, tolerance)
             costs.append((float(solution.cost_before), float(solution.cost)))
             into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
             if joins.any():
                 merged += int(joins.sum())
                 problem, lines = _renamed(problem, lines, representatives(into, joins))
-                pieces = _cut(problem, pieces)
+                dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
                 problem, lines, solution = _solved(
-                    config, problem, lines, pieces, tolerance, sure=left == 0
+                    config, problem, lines, dissection, tolerance, sure=left == 0
                 )
                 costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
@@ -205,18 +206,12 @@ _narrowed = jax.jit(kf.narrowed, static_argnums=1)
 _shown = jax.jit(associate)
 
 
-def _cut(problem: Problem, before: Pieces | None) -> Pieces:
-    """By the present associations, with as much room as before at least."""
-    room = (0, 0, 0)
-    if before is not None:
-        room = (before.own.shape[1], before.left.shape[0], before.border.shape[1])
-    return cut(problem.keyframes, problem.start.line.shape[0], room=room)
-
-
-def _solved(config, problem: Problem, lines: Lines, pieces: Pieces, tolerance: float, sure=True):
+def _solved(
+    config, problem: Problem, lines: Lines, dissection: Dissection, tolerance: float, sure=True
+):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
-    solution = solve(problem, pieces, sure=sure, tolerance=tolerance)
+    solution = solve(problem, dissection, sure=sure, tolerance=tolerance)
     return *_settled(config, problem, lines, solution), solution
 
 

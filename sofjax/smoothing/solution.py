@@ -8,8 +8,9 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.smoothing.blocks import Jacobian
+from sofjax.smoothing.dissection import Dissection, dissect, divide
+from sofjax.smoothing.elimination import DissectionSolver, eliminate
 from sofjax.smoothing.marginals import Marginals, marginals
-from sofjax.smoothing.pieces import Pieces, PiecewiseSolver, cut, reduce
 from sofjax.smoothing.problem import Problem, Residuals, Unknowns, residuals
 
 TOLERANCE = 1e-4  # metres and radians
@@ -49,7 +50,7 @@ def _cost(r: Residuals) -> Float[Array, ""]:
 
 def solve(
     problem: Problem,
-    pieces: Pieces | None = None,
+    dissection: Dissection | None = None,
     max_steps: int = 60,
     sure: bool = True,
     tolerance: float = TOLERANCE,
@@ -57,22 +58,24 @@ def solve(
     """Levenberg-Marquardt from `problem.start`. Expects float64; see `jax.enable_x64`.
 
     **Arguments:**
-    - `pieces`: of `cut`, which is asked if they are not given; it needs numbers, not tracers.
+    - `dissection`: of `dissect`, which is asked if it is not given; it needs numbers, not tracers.
     - `sure`: whether the covariances are wanted; they cost as much as some steps.
     - `tolerance`: metres and radians, of the last step of any pose.
 
     **Returns:** the estimate with marginal covariances, or zeros for them. `converged` is false
     where `max_steps` did not suffice; the estimate is then the best so far.
     """
-    if pieces is None:
-        pieces = cut(problem.keyframes, problem.start.line.shape[0])
-    return _solve(problem, pieces, max_steps, jnp.asarray(sure), jnp.asarray(tolerance))
+    if dissection is None:
+        start = problem.start
+        leaf = divide(np.asarray(start.pose[:, :2]))
+        dissection = dissect(problem.keyframes, start.line.shape[0], leaf)
+    return _solve(problem, dissection, max_steps, jnp.asarray(sure), jnp.asarray(tolerance))
 
 
 @eqx.filter_jit
 def _solve(
     problem: Problem,
-    pieces: Pieces,
+    dissection: Dissection,
     max_steps: int,
     sure: Bool[Array, ""],
     tolerance: Float[Array, ""],
@@ -81,7 +84,7 @@ def _solve(
         rtol=tolerance,
         atol=tolerance,
         norm=_norm,
-        linear_solver=PiecewiseSolver(problem.keyframes, pieces),
+        linear_solver=DissectionSolver(problem.keyframes, dissection),
     )
     found = optx.least_squares(
         residuals, solver, problem.start, problem, max_steps=max_steps, throw=False
@@ -102,7 +105,7 @@ def _solve(
         cost=_cost(r),
         steps=found.stats["num_steps"],
         converged=found.result == optx.RESULTS.successful,
-        marginals=_if(sure, lambda: marginals(reduce(blocks, pieces))),
+        marginals=_if(sure, lambda: marginals(eliminate(blocks, dissection))),
         kappa_free=free,
         kappa_sigma=jnp.sqrt(alone[:, 2, 2]),
     )
