@@ -15,7 +15,7 @@ from sofjax.simulation import Detection, Odometer, Scene, observe, random_rig, t
 IMAGES = 160
 EXACT = Odometer(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 EXACT_MODEL = MotionModel(*[0.0] * 7)
-LSD = Detection(shortening=1.0, broken=0.0, false_segments=0.0, missed=0.05, apart=0.0)
+LSD = Detection(shortening=1.0, broken=0.0, false_segments=0.0, missed=0.05)
 
 
 def make_log(world, seed: int, noise: float, odometer: Odometer = EXACT):
@@ -24,9 +24,9 @@ def make_log(world, seed: int, noise: float, odometer: Odometer = EXACT):
     ride = take_ride(world, rig, seed, IMAGES)
     scene = Scene.of(world, edges=2048, walls=256)
     scene = eqx.tree_at(
-        lambda s: (s.contrast, s.narrow),
+        lambda s: (s.contrast, s.width),
         scene,
-        (jnp.where(scene.on_floor, scene.contrast, 0), jnp.zeros_like(scene.narrow)),
+        (jnp.where(scene.on_floor, scene.contrast, 0), jnp.zeros_like(scene.width)),
     )
     log = _observe(
         scene, rig.camera_file.camera, ride.mounts, ride.poses(), ride.motions(),

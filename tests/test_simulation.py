@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 import re
 import time
 from functools import cache
@@ -450,7 +451,7 @@ def test_lsd_errs_on_drawn_images_as_on_the_sample_drive():
 
 CAMERA = Camera(jnp.array([[291.0, 0.0, 159.5], [0.0, 291.0, 119.5], [0.0, 0.0, 1.0]]), 320, 240)
 EXACT = Detection(
-    noise=0.0, shortening=0.0, missed=0.0, full_contrast=1e-6, fading=1.0, apart=0.0, broken=0.0,
+    noise=0.0, shortening=0.0, missed=0.0, least_contrast=0.0, full_contrast=1e-6, broken=0.0,
     false_segments=0.0, shortest=3.0, max_depth=8.0,
 )  # fmt: skip
 
@@ -468,12 +469,17 @@ def scene_of(name, seed=0):
     return Scene.of(world_of(name, seed), edges=768, walls=16)
 
 
+def without_width(scene):
+    """Its fine lines seen as one line each, in their middle."""
+    return dataclasses.replace(scene, width=jnp.zeros_like(scene.width))
+
+
 def seen_exactly(name, seed, frames):
     ride = ride_of(name, seed)
     poses = jax.tree.map(lambda leaf: leaf[jnp.asarray(frames)], ride.poses())
     mounts = jax.tree.map(lambda leaf: leaf[jnp.asarray(frames)], ride.mounts)
     key = jax.random.key(0)
-    return ride, look(scene_of(name, seed), CAMERA, mounts, poses, poses, key, EXACT)
+    return ride, look(without_width(scene_of(name, seed)), CAMERA, mounts, poses, poses, key, EXACT)
 
 
 @pytest.mark.parametrize(("name", "seed"), [("l", 2), ("eight", 0), ("random", 3)])
@@ -510,7 +516,7 @@ def test_exact_segments_are_visible_parts_of_the_worlds_edges(name, seed):
 def test_segments_end_where_a_wall_hides_the_rest():
     """From the stem of the L the floor behind the inner corner cannot be seen."""
     world = world_of("l", 2)
-    scene = scene_of("l", 2)
+    scene = without_width(scene_of("l", 2))
     floor_alone = jnp.where(scene.on_floor, scene.contrast, 0)
     scene = dataclasses.replace(scene, contrast=floor_alone)
     pose = SE2(jnp.tile(jnp.array([0.0, 5.0]), (FRAMES, 1)), jnp.full(FRAMES, 1.2))
@@ -577,23 +583,97 @@ def test_misses_and_inventions_are_as_many_as_asked():
     assert count(broken=1.0) > 1.5 * all_of_them
 
 
-def test_a_narrow_line_comes_as_its_two_edges():
-    world, mounts = world_of("l", 2), forty_drives()[0]
+def one_line(y, width, contrast=0.3, length=0.4):
+    """A scene of one line of some width across the way, y metres ahead of the first corner."""
+    ends = np.zeros((768, 2, 3), np.float32)
+    ends[0] = [[-length, y, 0], [length, y, 0]]
+    of_first = lambda value: jnp.zeros(768).at[0].set(value)
+    return Scene(
+        jnp.asarray(ends), of_first(contrast), of_first(1) > 0, of_first(width),
+        jnp.zeros((16, 2, 2)),
+    )  # fmt: skip
+
+
+def edges_of_line(scene, detection=EXACT):
+    """Segments of the first image, from 1 m above the origin, looking along y and down by 0.2."""
+    pose = SE2(jnp.zeros((FRAMES, 2)), jnp.full(FRAMES, jnp.pi / 2))
+    mount = Mount.create(1.0, 0.2)
+    mounts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (FRAMES,)), mount)
+    seen = look(scene, CAMERA, mounts, pose, pose, jax.random.key(0), detection).segments_image
+    return np.asarray(seen.endpoints[0])[np.asarray(seen.valid[0])]
+
+
+def rows_of(*ys):
+    """Where floor points ahead project, by the mount of `edges_of_line`: image rows and depths."""
+    y = np.array(ys)
+    depth = y * np.cos(0.2) + np.sin(0.2)
+    return 119.5 + 291 * (np.cos(0.2) - y * np.sin(0.2)) / depth, depth
+
+
+def test_a_broad_line_is_seen_where_its_edges_are():
+    ends = edges_of_line(one_line(2.0, 0.1), dataclasses.replace(EXACT, blur=1.0))
+    far, near = rows_of(2.05, 1.95)[0]
+    assert near - far > 6
+    np.testing.assert_allclose(np.sort(ends[:, :, 1].mean(1)), [far, near], atol=0.15)
+    assert ((ends[0, 1] - ends[0, 0]) @ (ends[1, 1] - ends[1, 0])) < 0  # darker on one hand
+
+
+@pytest.mark.parametrize(("y", "width"), [(2.0, 0.002), (4.0, 0.004), (6.0, 0.01)])
+def test_a_fine_lines_edges_are_never_nearer_than_the_blur_leaves_them(y, width):
+    """Fields of a Gaussian's slope, by sums: the middle of what is left on either side."""
+    blur = 1.2
+    ends = edges_of_line(one_line(y, width), dataclasses.replace(EXACT, blur=blur))
+    w = -np.diff(rows_of(y - width / 2, y + width / 2)[0])[0]
+    x = np.linspace(0, 12, 12001)
+    left = np.exp(-((x - w / 2) ** 2) / (2 * blur**2)) - np.exp(-((x + w / 2) ** 2) / (2 * blur**2))
+    apart = 2 * (x * left).sum() / left.sum()
+    rows = np.sort(ends[:, :, 1].mean(1))
+    assert rows[1] - rows[0] == pytest.approx(apart, abs=0.02)
+    assert rows[1] - rows[0] > max(2.5 * blur, w)
+    assert rows.mean() == pytest.approx(rows_of(y)[0][0], abs=0.02)
+
+
+def test_a_fine_line_fades_with_distance_and_a_step_does_not():
+    def seen_from(width):
+        detection = dataclasses.replace(EXACT, least_contrast=0.05, full_contrast=0.05001, blur=1.0)
+        ys = np.arange(1.5, 7.0, 0.25)
+        return ys, np.array([len(edges_of_line(one_line(y, width), detection)) for y in ys])
+
+    ys, counts = seen_from(0.01)
+    rows = np.array([-np.diff(rows_of(y - 0.005, y + 0.005)[0])[0] for y in ys])
+    left = np.array([math.erf(w / 8**0.5) for w in rows])
+    assert (counts[0.3 * left > 0.052] == 2).all() and (counts[0.3 * left < 0.048] == 0).all()
+    assert 3 < (counts > 0).sum() < len(ys) - 3
+    assert (seen_from(0.0)[1] == 1).all()
+
+
+def test_a_fine_line_that_runs_away_ends_where_it_fades_and_its_edges_converge():
+    scene = one_line(2.0, 0.008)
+    ends = scene.edges_world.at[0].set(jnp.array([[0.3, 1.0, 0.0], [0.3, 9.0, 0.0]]))
+    scene = dataclasses.replace(scene, edges_world=ends)
+    detection = dataclasses.replace(EXACT, least_contrast=0.05, full_contrast=0.05001, blur=1.0)
+    found = edges_of_line(scene, detection)
+    assert len(found) == 2
+    found = found[np.arange(2)[:, None], np.argsort(-found[:, :, 1], axis=1)]  # near end first
+    near, far = np.linalg.norm(found[0] - found[1], axis=-1)
+    assert near > far > 2.5
+    as_far_as_it_runs = rows_of(7.9)[0][0]  # 8 metres of depth
+    assert found[:, 1, 1].min() > as_far_as_it_runs + 1
+
+
+def test_a_joint_of_a_world_comes_as_its_two_edges_by_chance():
     scene = scene_of("l", 2)
-    scene = dataclasses.replace(scene, contrast=jnp.where(scene.narrow, scene.contrast, 0))
+    scene = dataclasses.replace(scene, contrast=jnp.where(scene.width > 0, scene.contrast, 0))
     pose = SE2(jnp.tile(jnp.array([0.0, 3.0]), (FRAMES, 1)), jnp.full(FRAMES, 1.5))
-    mounts = jax.tree.map(lambda leaf: leaf[0], mounts)
-    detection = dataclasses.replace(EXACT, apart=3.0)
-    observed = look(scene, CAMERA, mounts, pose, pose, jax.random.key(0), detection)
-    ends = np.asarray(observed.segments_image.endpoints[0])[
-        np.asarray(observed.segments_image.valid[0])
-    ]
-    assert "grout" in world.floor_segments.kinds and len(ends) > 6
-    for segment in ends:
-        d = segment[1] - segment[0]
-        normal = np.array([-d[1], d[0]]) / np.linalg.norm(d)
-        offsets = np.abs((ends - segment[0]) @ normal)
-        assert np.isclose(offsets, 3.0, atol=0.05).all(1).any()
+    mounts = jax.tree.map(lambda leaf: leaf[0], forty_drives()[0])
+
+    def count(**changes):
+        detection = dataclasses.replace(EXACT, least_contrast=0.03, full_contrast=0.1, **changes)
+        observed = look(scene, CAMERA, mounts, pose, pose, jax.random.key(0), detection)
+        return int(observed.segments_image.valid.sum())
+
+    assert "grout" in world_of("l", 2).floor_segments.kinds
+    assert count(missed=1.0) == 0 < count(missed=0.6) < count(blur=2.0) < count()
 
 
 def test_scratch_memory_does_not_grow_with_the_images():

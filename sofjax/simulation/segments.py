@@ -3,6 +3,11 @@
 Pure functions of one image, mapped over the images of a drive and, by `jax.vmap`, over drives.
 What hides an edge are the walls in the plan, exactly, by the shadow that each wall throws from
 the camera; boxes hide nothing. Of an edge that is seen in several parts, one part is reported.
+
+A line of some millimetres is seen as its two edges. It is w pixels broad in the image, less the
+farther it is, and a blur of standard deviation b leaves the share erf(w / √8 b) of its contrast:
+it fades with distance. The two slopes that are left have their middles w / share apart, on either
+side of the line: that is √(2π) b for the finest line and w for a broad one.
 """
 
 import equinox as eqx
@@ -31,7 +36,7 @@ class Scene(eqx.Module):
     edges_world: Float[Array, "*batch edges 2 3"]  # metres; floor, raised and mirrored edges
     contrast: Float[Array, "*batch edges"]  # step of brightness, 0 to 1; padding has 0
     on_floor: Bool[Array, "*batch edges"]
-    narrow: Bool[Array, "*batch edges"]  # a line of some millimetres, seen as two edges
+    width: Float[Array, "*batch edges"]  # metres, of a line that is seen as two edges; others 0
     walls_world: Float[Array, "*batch walls 2 2"]  # metres; padding has no length
 
     @staticmethod
@@ -44,14 +49,16 @@ class Scene(eqx.Module):
         endpoints = np.concatenate([kind.endpoints for kind in kinds])
         contrast = np.concatenate([kind.contrast for kind in kinds])
         on_floor = np.arange(len(contrast)) < len(kinds[0].contrast)
-        narrow = np.array([kind in NARROW for parts in kinds for kind in parts.kinds])
+        width = np.zeros(len(contrast))
+        narrow = [kind in NARROW for parts in kinds for kind in parts.kinds]
+        width[narrow] = world.floor_lines.widths
         edges = edges or -(-len(contrast) // 64) * 64
         walls = walls or -(-len(world.walls) // 8) * 8
         return Scene(
             jnp.asarray(_pad(endpoints, edges, "edges"), float),
             jnp.asarray(_pad(contrast, edges, "edges"), float),
             jnp.asarray(_pad(on_floor, edges, "edges")),
-            jnp.asarray(_pad(narrow, edges, "edges")),
+            jnp.asarray(_pad(width, edges, "edges"), float),
             jnp.asarray(_pad(world.walls, walls, "walls"), float),
         )
 
@@ -63,14 +70,18 @@ def _pad(rows: np.ndarray, length: int, what: str) -> np.ndarray:
 
 
 class Detection(eqx.Module):
-    """How a line detector errs; the defaults are those of LSD on 320×240 pixels."""
+    """How a line detector errs; the defaults are those of LSD on 320×240 pixels.
+
+    `blur` and the contrasts are measured on drawn images of narrow lines, by
+    `experiments/random_worlds/narrow_lines.py`.
+    """
 
     noise: float = 0.25  # pixels, standard deviation of an end across the line
     shortening: float = 1.5  # pixels that an end is short of the edge's, mean size
     missed: float = 0.1  # share of edges of good contrast that are not seen
-    full_contrast: float = 0.1  # step of brightness from which an edge's contrast is good
-    fading: float = 0.3  # share of a narrow line's contrast that the blur leaves
-    apart: float = 2.4  # pixels between the two edges that are seen of a narrow line
+    least_contrast: float = 0.04  # step of brightness below which no edge is seen
+    full_contrast: float = 0.1  # ... and from which its contrast is good; between, in proportion
+    blur: float = 1.05  # pixels, standard deviation: lens, pixels and detector together
     broken: float = 0.25  # share of edges that come in two pieces
     false_segments: float = 2.0  # mean number an image
     shortest: float = 15.0  # pixels
@@ -123,34 +134,43 @@ def see(
     C = T_world_robot.apply(mount.T_robot_foot.xy)
     homogeneous = jnp.pad(scene.edges_world, ((0, 0), (0, 0), (0, 1)), constant_values=1.0) @ P.T
 
-    # Inside the picture, and of some length there
-    part = jax.vmap(in_picture, in_axes=(0, None, None))(homogeneous, camera, detection.max_depth)
+    # Inside the picture, and of some length there; fine lines no farther than they can be seen
+    breadth = jax.vmap(breadth_in_image, in_axes=(0, 0, 0, None))(
+        homogeneous, scene.edges_world, scene.width, P
+    )
+    reach = seen_until(breadth, scene.contrast, detection.least_contrast, detection)
+    part = jax.vmap(in_picture, in_axes=(0, None, 0))(homogeneous, camera, reach)
     length = jax.vmap(length_in_image)(homogeneous, part)
     candidates = min(CANDIDATES, len(scene.contrast))
     length, chosen = jax.lax.top_k(jnp.where(scene.contrast > 0, length, 0), candidates)
-    homogeneous, part = homogeneous[chosen], part[chosen]
+    homogeneous, part, breadth = homogeneous[chosen], part[chosen], breadth[chosen]
     plan = scene.edges_world[chosen, :, :2] - C[None, None]
 
     # Not behind a wall
     part = jax.vmap(unhidden, in_axes=(0, 0, None))(plan, part, scene.walls_world - C[None, None])
     segments = jax.vmap(project)(homogeneous, part)
 
-    # As a detector reports them
+    # As a detector reports them, each of the two edges of a fine line by a draw of its own
     miss_key, break_key, false_key, noise_key = jax.random.split(key, 4)
-    narrow = scene.narrow[chosen]
-    contrast = scene.contrast[chosen] * jnp.where(narrow, detection.fading, 1)
-    clear = jnp.minimum(contrast / detection.full_contrast, 1)
-    detected = jax.random.uniform(miss_key, clear.shape) < clear * (1 - detection.missed)
-    detected &= part[:, 1] > part[:, 0]
+    seldom = jax.random.uniform(miss_key, (candidates, 2)) / (1 - detection.missed)
+    wanted = detection.least_contrast + seldom * (
+        detection.full_contrast - detection.least_contrast
+    )
+    wanted = jnp.where(seldom < 1, wanted, jnp.inf)
+    reach = seen_until(breadth[:, None], scene.contrast[chosen, None], wanted, detection)
     pieces, whole = jax.vmap(break_up, in_axes=(0, 0, None))(
         segments, jax.random.uniform(break_key, (candidates, 3)), detection.broken
     )
-    doubled = jax.vmap(both_edges, in_axes=(0, None))(segments, detection.apart)
-    pieces = jnp.where(narrow[:, None, None, None], doubled, pieces)
-    whole |= narrow[:, None]
+    whole &= ((part[:, 1] > part[:, 0]) & (reach[:, 0] > 0))[:, None]
+    edges, seen = jax.vmap(both_edges, in_axes=(0, 0, 0, 0, None))(
+        homogeneous, part, breadth, reach, detection.blur
+    )
+    fine = breadth > 0
+    pieces = jnp.where(fine[:, None, None, None], edges, pieces)
+    whole = jnp.where(fine[:, None], seen, whole)
     invented, there = invent(camera, detection, false_key)
     endpoints = jnp.concatenate([pieces.reshape(-1, 2, 2), invented])
-    valid = jnp.concatenate([(detected[:, None] & whole).reshape(-1), there])
+    valid = jnp.concatenate([whole.reshape(-1), there])
     draws = jax.random.normal(noise_key, (len(endpoints), 2, 2))
     endpoints = jax.vmap(disturb, in_axes=(0, 0, None))(endpoints, draws, detection)
     valid &= Segments(endpoints, valid).length >= detection.shortest
@@ -251,12 +271,68 @@ def break_up(
     return jnp.stack([first, jnp.stack([inner[1], segment[1]])]), jnp.stack([breaks | True, breaks])
 
 
+def breadth_in_image(
+    homogeneous: Float[Array, "2 3"],
+    edge_world: Float[Array, "2 3"],
+    width: Float[Array, ""],
+    P: Float[Array, "3 4"],
+) -> Float[Array, ""]:
+    """How broad a floor line of some width is in the image, as pixels × metres of depth.
+
+    Across a straight line in the image this is the same all along it.
+    """
+    line = jnp.cross(homogeneous[0], homogeneous[1])
+    across = jnp.append(_normal(edge_world[:, :2]), 0)
+    return width * jnp.abs(safe_divide(line @ (P[:, :3] @ across), safe_norm(line[:2])))
+
+
+def share_left(w: Float[Array, "*any"], blur: Float[Array, ""] | float) -> Float[Array, "*any"]:
+    """Share of its contrast that a line `w` pixels broad keeps when blurred."""
+    return jax.scipy.special.erf(w / (8**0.5 * blur))
+
+
+def seen_until(
+    breadth: Float[Array, "*#any"],
+    contrast: Float[Array, "*#any"],
+    wanted: Float[Array, "*#any"] | Float[Array, ""] | float,
+    detection: Detection,
+) -> Float[Array, "*#any"]:
+    """Depth in metres at which an edge's contrast falls to what is wanted; 0 if it is less at once.
+
+    A line without breadth is an edge that does not fade, seen to `max_depth`.
+    """
+    least = 8**0.5 * detection.blur * jax.scipy.special.erfinv(safe_divide(wanted, contrast))
+    fades = jnp.where(breadth > 0, breadth / jnp.maximum(least, 1e-6), jnp.inf)
+    return jnp.where(wanted < contrast, jnp.minimum(fades, detection.max_depth), 0)
+
+
 def both_edges(
-    segment: Float[Array, "2 2"], apart: Float[Array, ""] | float
-) -> Float[Array, "2 2 2"]:
-    """The two edges of a narrow line, beside its middle in the image."""
-    shift = apart / 2 * _normal(segment)
-    return jnp.stack([segment + shift[None], segment - shift[None]])
+    homogeneous: Float[Array, "2 3"],
+    part: Float[Array, "2"],
+    breadth: Float[Array, ""],
+    reach: Float[Array, "2"],
+    blur: Float[Array, ""] | float,
+) -> tuple[Float[Array, "2 2 2"], Bool[Array, "2"]]:
+    """The two edges of a fine line, beside its middle in the image, and which of them are there.
+
+    They run in opposite directions, as with the darker side on one hand.
+
+    **Arguments:**
+    - `part`: shares (from, to) of the line that are in sight.
+    - `reach`: depth in metres to which either edge is seen.
+    """
+    depth = homogeneous[:, 2]
+
+    def edge(reach: Float[Array, ""], side: Float[Array, ""]) -> tuple[Array, Array]:
+        near = _where_positive(reach - depth)
+        seen = jnp.stack([jnp.maximum(part[0], near[0]), jnp.minimum(part[1], near[1])])
+        ends = project(homogeneous, seen)
+        w = breadth / jnp.maximum(depth[0] + seen * (depth[1] - depth[0]), NEAREST_DEPTH)
+        away = jnp.maximum(w, 1e-3) / share_left(jnp.maximum(w, 1e-3), blur) / 2
+        return ends + side * away[:, None] * _normal(ends)[None], seen[1] > seen[0]
+
+    ends, there = jax.vmap(edge)(reach, jnp.array([1.0, -1.0]))
+    return jnp.stack([ends[0], ends[1, ::-1]]), there
 
 
 def _normal(segment: Float[Array, "2 2"]) -> Float[Array, "2"]:
