@@ -10,16 +10,20 @@ uses all cores already. On a cluster, start `worker.py` on each machine.
 """
 
 import json
+import os
 import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1]))
 import common
+
+jax.config.update("jax_num_cpu_devices", os.cpu_count())  # for many runs: before jax begins
 
 USUAL = {"particles": 1000, "segments": 64, "map": 1024}
 SIZES = {
@@ -32,7 +36,6 @@ FEW = {"particles": (10, 1000), "segments": (16, 64), "map": (64,)}
 
 def measure(seed: int, images: int, particles: int, segments: int, map: int) -> dict[str, float]:
     """Milliseconds of a step, after it was compiled; and what compiling took."""
-    import jax
     import jax.numpy as jnp
 
     from sofjax import slam
@@ -67,18 +70,26 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
 
 
 def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, float]:
-    """Seconds of one call for many seeds of the filter, and of a call for each, alternating."""
-    import jax
+    """Seconds of one call for many seeds of the filter, and of a call for each, alternating.
+
+    Every core is a device of its own: runs have nothing to tell each other, so that each device
+    takes its share of them. The calls one by one are those of a user: one device, which is free to
+    use all cores.
+    """
+    from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
     from sofjax import slam
+
+    mesh = jax.make_mesh((len(jax.devices()),), ("runs",), axis_types=(AxisType.Auto,))
+    shared = NamedSharding(mesh, PartitionSpec("runs"))
 
     drive = common.random_drive("random", seed, images)
     args = (drive.camera, drive.mount, jax.tree.map(jax.numpy.asarray, drive.observations))
     config = common.config_of(filter={"particles": 256})
     keys = jax.random.split(jax.random.key(seed), runs)
-    together = lambda args, keys: common.run_batch(
-        config, *jax.tree.map(lambda a: jax.numpy.broadcast_to(a, (runs, *a.shape)), args), keys
-    )
+    of_all = jax.tree.map(lambda a: jax.numpy.broadcast_to(a, (runs, *a.shape)), args)
+    of_all, all_keys = jax.device_put((of_all, keys), shared)
+    together = lambda: common.run_batch(config, *of_all, all_keys)
 
     @jax.jit
     def alone(args, key):
@@ -92,9 +103,9 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
     calls = lambda: [jax.block_until_ready(alone(args, key)) for key in keys]
     compiling = {
         "one": timed(lambda: alone(args, keys[0])),
-        "many": timed(lambda: together(args, keys)),
+        "many": timed(together),
     }
-    one, many = np.median([(timed(calls), timed(lambda: together(args, keys)))
+    one, many = np.median([(timed(calls), timed(together))
                            for _ in range(rounds)], axis=0)  # fmt: skip
     return {
         "runs": runs, "images": images, "calls_cpu_s": one[0], "calls_wall_s": one[1],

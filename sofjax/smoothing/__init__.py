@@ -3,8 +3,8 @@
 Least squares by optimistix over the keyframes of a drive. The residuals are distances in pixels of
 the end points of each observed segment from its map line, transferred into the image, and the
 odometer's readings with their covariance. An observation ties one pose to one line, the odometer
-one pose to the next: so the drive is cut into pieces, each of which eliminates its poses and the
-lines that only it sees, and a dense system of what several pieces see remains.
+one pose to the next: so the keyframes are divided by place, and what is known in one place only is
+eliminated there (`dissection`, `elimination`), however often places are passed and in what order.
 
 `solve` is one solution for associations that are given; `smooth` finds the associations as well.
 """
