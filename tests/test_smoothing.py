@@ -129,7 +129,7 @@ def test_keyframes_of_one_place_are_of_one_leaf_however_often_it_is_passed(rng):
     xy = np.concatenate([lap, lap[::-1], lap]) + rng.normal(0, 0.01, (600, 2))
     leaf = divide(xy)
     assert leaf.max() == 15
-    assert np.bincount(leaf).max() <= 48
+    assert np.bincount(leaf).max() <= 128
     for i in range(16):
         assert np.ptp(xy[leaf == i, 0]) < 60 / 16 + 0.5
 

@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 from sofjax.smoothing.problem import LINE, POSE, SHARED, Keyframes
 
 BRANCH = 4  # nodes that are gathered to one
-LEAF = 128  # keyframes of a leaf at most
+LEAF = 48  # keyframes of a leaf at most
+SHORT, LEAF_OF_SHORT = 1024, 128  # short drives compile longer than they compute: a lower tree
 ROUND = 16  # sizes of a node's tables are multiples of it
 SLACK = 1.15  # better poses show more: room for that, lest all is compiled again
 
@@ -60,7 +61,8 @@ class Dissection(eqx.Module):
 def divide(xy: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
     """Leaves of keyframes by place: halved across the longer side, again and again."""
     groups = [np.arange(len(xy))]
-    while len(groups[0]) > LEAF:
+    most = LEAF if len(xy) > SHORT else LEAF_OF_SHORT
+    while len(groups[0]) > most:
         for _ in range(BRANCH.bit_length() - 1):
             halves = []
             for group in groups:
