@@ -1,29 +1,26 @@
 """What a step costs, by particles, segments of an image, slots of the map, runs, and processes.
 
-    python experiments/scaling/run.py [--quick] [--images 20] [--out DIR]
+    python experiments/scaling/run.py [--quick] [--images 20] [--only runs] [--out DIR]
 
 One stretch of a drive is run with one size changed at a time; compiling is told apart. Then 64
-runs of 256 particles over 300 images, one call after the other and all in one call. The last part
+runs of 256 particles over 300 images, by `many_runs.py`, one call after the other and all in one
+call. The last part
 shares the particles of one filter among processes by jax.distributed, against one process:
 on one machine this shows that the results are the same, not that it is faster, as one process
 uses all cores already. On a cluster, start `worker.py` on each machine.
 """
 
 import json
-import os
 import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1]))
 import common
-
-jax.config.update("jax_num_cpu_devices", os.cpu_count())  # for many runs: before jax begins
 
 USUAL = {"particles": 1000, "segments": 64, "map": 1024}
 SIZES = {
@@ -36,6 +33,7 @@ FEW = {"particles": (10, 1000), "segments": (16, 64), "map": (64,)}
 
 def measure(seed: int, images: int, particles: int, segments: int, map: int) -> dict[str, float]:
     """Milliseconds of a step, after it was compiled; and what compiling took."""
+    import jax
     import jax.numpy as jnp
 
     from sofjax import slam
@@ -69,51 +67,6 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
     }
 
 
-def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, float]:
-    """Seconds of one call for many seeds of the filter, and of a call for each, alternating.
-
-    Every core is a device of its own: runs have nothing to tell each other, so that each device
-    takes its share of them. The calls one by one are those of a user: one device, which is free to
-    use all cores.
-    """
-    from jax.sharding import AxisType, NamedSharding, PartitionSpec
-
-    from sofjax import slam
-
-    mesh = jax.make_mesh((len(jax.devices()),), ("runs",), axis_types=(AxisType.Auto,))
-    shared = NamedSharding(mesh, PartitionSpec("runs"))
-
-    drive = common.random_drive("random", seed, images)
-    args = (drive.camera, drive.mount, jax.tree.map(jax.numpy.asarray, drive.observations))
-    config = common.config_of(filter={"particles": 256})
-    keys = jax.random.split(jax.random.key(seed), runs)
-    of_all = jax.tree.map(lambda a: jax.numpy.broadcast_to(a, (runs, *a.shape)), args)
-    of_all, all_keys = jax.device_put((of_all, keys), shared)
-    together = lambda: common.run_batch(config, *of_all, all_keys)
-
-    @jax.jit
-    def alone(args, key):
-        return slam.run(config, *args[:2], slam.init(config, *args[:2], key, common.M), args[2])[1]
-
-    def timed(call):
-        c, w = time.process_time(), time.perf_counter()
-        jax.block_until_ready(call())
-        return time.process_time() - c, time.perf_counter() - w
-
-    calls = lambda: [jax.block_until_ready(alone(args, key)) for key in keys]
-    compiling = {
-        "one": timed(lambda: alone(args, keys[0])),
-        "many": timed(together),
-    }
-    one, many = np.median([(timed(calls), timed(together))
-                           for _ in range(rounds)], axis=0)  # fmt: skip
-    return {
-        "runs": runs, "images": images, "calls_cpu_s": one[0], "calls_wall_s": one[1],
-        "call_cpu_s": many[0], "call_wall_s": many[1], "cpu_ratio": one[0] / many[0],
-        "wall_ratio": one[1] / many[1], "first_cpu_s": {k: v[0] for k, v in compiling.items()},
-    }  # fmt: skip
-
-
 def draw(table: dict, path: Path) -> None:
     plot, axes = common.pyplot().subplots(1, 3, figsize=(12, 3.6), layout="constrained")
     for axis, (name, rows) in zip(axes, table.items(), strict=True):
@@ -143,12 +96,7 @@ def start(args, processes):
     return json.loads(said[0].splitlines()[-1])
 
 
-def main():
-    parser = common.options(__doc__, __file__)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--images", type=int, default=20)
-    args = parser.parse_args()
-    args.images = 10 if args.quick else args.images
+def steps(args):
     table = {}
     for name, sizes in (FEW if args.quick else SIZES).items():
         table[name] = {}
@@ -157,14 +105,38 @@ def main():
             table[name][size] = row
             print(f"{size:7d} {name:10s}" + "".join(f"{k} {v:9.2f}   " for k, v in row.items()),
                   flush=True)  # fmt: skip
-    runs = many_runs(args.seed, *(10, 4) if args.quick else (300, 64))
-    print(json.dumps(runs, indent=1), flush=True)
+    return table
+
+
+def runs_of(args):
+    size = ["--images", "10", "--runs", "4"] if args.quick else []
+    script = Path(__file__).with_name("many_runs.py")
+    command = [sys.executable, str(script), "--seed", str(args.seed), *size]
+    said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
+    print(said, flush=True)
+    return json.loads(said)
+
+
+def processes_of(args):
     one, many = start(args, 1), start(args, args.processes)
     apart = float(np.abs(np.array(one.pop("xy")) - np.array(many.pop("xy"))).max())
     processes = {"one": one, "many": many, "furthest_apart_m": apart}
     print(json.dumps(processes, indent=1))
-    common.save(args.out, "scaling", args, {"steps": table, "runs": runs, "processes": processes})
-    draw(table, args.out / "scaling.png")
+    return processes
+
+
+def main():
+    parser = common.options(__doc__, __file__)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--images", type=int, default=20)
+    parser.add_argument("--only", choices=("steps", "runs", "processes"), help="one of the parts")
+    args = parser.parse_args()
+    args.images = 10 if args.quick else args.images
+    parts = {"steps": steps, "runs": runs_of, "processes": processes_of}
+    told = {name: part(args) for name, part in parts.items() if args.only in (None, name)}
+    common.save(args.out, "scaling", args, told)
+    if "steps" in told:
+        draw(told["steps"], args.out / "scaling.png")
 
 
 if __name__ == "__main__":

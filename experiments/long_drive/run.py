@@ -1,9 +1,10 @@
 """A long drive, every corridor of it twice: what does it cost to run and to smooth?
 
-    python experiments/loops/hour.py [--quick] [--rings 16] [--seed S] [--out DIR]
+    python experiments/long_drive/run.py [--quick] [--rings 16] [--seed S] [--out DIR]
 
 Rings of corridors beside each other, each driven twice before the next, over dark blocks every
-2.3 m, seen as segments. hour.json has the seconds, the peak of the memory, and the errors.
+2.3 m, seen as segments. long_drive.json has the seconds, the peak of the memory and the errors;
+long_drive.png the map, and the errors along the way.
 """
 
 import json
@@ -39,6 +40,23 @@ def make_rings(seed: int, rings: int):
 def peak() -> float:
     """GiB that this process held at most until now."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def draw(drive, online, done, path: Path) -> None:
+    from matplotlib.collections import LineCollection
+
+    plot, (above, below) = common.pyplot().subplots(2, 1, figsize=(11, 5.5), layout="constrained")
+    ends = np.asarray(done.endpoints_world)[done.lines.valid & ~done.lines.raised]
+    above.add_collection(LineCollection(ends, colors="#1f618d", lw=0.7))
+    above.plot(*common.in_start(drive.truth)[:, :2].T, color="black", lw=0.5)
+    above.set(xlabel="m", ylabel="m", aspect="equal", title="the smoothed map and the true way")
+    way = np.append(0, np.cumsum(np.hypot(*np.diff(drive.truth.xy, axis=0).T)))
+    for poses, label in ((online, "while driving"), (done.T_world_robot, "smoothed")):
+        off = common.in_start(common.path_of(drive, poses)) - common.in_start(drive.truth)
+        below.plot(way, np.hypot(off[:, 0], off[:, 1]), label=label)
+    below.set(xlabel="m driven", ylabel="off in the frame of the start, m")
+    below.legend()
+    plot.savefig(path, dpi=110)
 
 
 def main() -> None:
@@ -78,7 +96,8 @@ def main() -> None:
         "odometry_percent": common.odometry_errors(drive).ate_percent,
         "online_percent": online.ate_percent, "smoothed_percent": solved.ate_percent,
     }  # fmt: skip
-    common.save(args.out, "hour", args, told)
+    common.save(args.out, "long_drive", args, told)
+    draw(drive, info.T_world_robot, done, args.out / "long_drive.png")
     print(json.dumps(told, indent=1))
 
 
