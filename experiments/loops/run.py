@@ -191,7 +191,7 @@ def main() -> None:
                   f"{row['smoothed_percent']:.3f} % smoothed, {row['closings']} closed, "
                   f"off by {row['off_m'][1] or float('nan'):.3f} m, "
                   f"NEES {row['nees'][-1]:.1f}, {row['seconds']:.0f} s", flush=True)  # fmt: skip
-            jax.clear_caches() if len(rows) % 20 == 0 else None
+            jax.clear_caches() if len(rows) % 5 == 0 else None
     told = summary(rows)
     common.save(args.out, "loops", args, told | {"each": rows})
     draw(rows, args.out / "loops.png")
