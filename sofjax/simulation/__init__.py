@@ -13,6 +13,7 @@ from sofjax.simulation.catalogue import WORLDS as WORLDS
 from sofjax.simulation.catalogue import around as around
 from sofjax.simulation.catalogue import furnish as furnish
 from sofjax.simulation.catalogue import make_world as make_world
+from sofjax.simulation.detection import Detection as Detection
 from sofjax.simulation.drawing import Artist as Artist
 from sofjax.simulation.drawing import Imaging as Imaging
 from sofjax.simulation.recording import record as record
@@ -23,7 +24,6 @@ from sofjax.simulation.rides import take_ride as take_ride
 from sofjax.simulation.rides import webcam as webcam
 from sofjax.simulation.robots import Driver as Driver
 from sofjax.simulation.robots import Odometer as Odometer
-from sofjax.simulation.segments import Detection as Detection
 from sofjax.simulation.segments import Scene as Scene
 from sofjax.simulation.segments import observe as observe
 from sofjax.simulation.worlds import World as World

@@ -108,10 +108,10 @@ def dissect(
             row[mine] = np.cumsum(size[mine]) - size[mine]
             row[others] = a + np.cumsum(size[others]) - size[others]
         parents = np.zeros((1, len(size) + 1), int) if above is None else above
-        in_parent = np.repeat(parents, BRANCH, axis=0)
+        in_parent = np.repeat(parents, BRANCH, axis=0)[: len(own)]
         rows = lambda variables, starts, width, none: jnp.asarray(np.stack([
             _filled(_unknowns(start[v], size[v]), width, none)
-            for v, start in zip(variables, starts, strict=False)
+            for v, start in zip(variables, starts, strict=True)
         ]))  # fmt: skip
         everywhere = [first] * len(own)
         generations.insert(0, Generation(

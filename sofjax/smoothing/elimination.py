@@ -60,7 +60,7 @@ def eliminate(blocks: Blocks, dissection: Dissection) -> Factors:
     pose, seen, pose_shared, line, line_shared = map(
         with_none, (blocks.pose, seen, blocks.pose_shared, blocks.line, blocks.line_shared)
     )
-    # of a pose with the one before it
+    # of a pose with the one before it; the last of `next` is zero
     following = jnp.concatenate([blocks.next[-1:], blocks.next[:-1], blocks.next[-1:]])
     width = sum(generations[0].own.shape[1:] + generations[0].border.shape[1:])
     plus = lambda start, count: start[..., None] + jnp.arange(count)
@@ -78,7 +78,7 @@ def eliminate(blocks: Blocks, dissection: Dissection) -> Factors:
             (poses, shared, pose_shared[i]),
             (mine, mine, line[k] / 2),
             (mine, shared, line_shared[k]),
-            (shared, shared, blocks.shared / 2 * is_first),
+            (shared, shared, blocks.shared / 2 * is_first),  # counts but once
         ):
             rows, columns = rows[..., :, None], columns[..., None, :]
             F = F.at[rows, columns].add(value, mode="drop")
