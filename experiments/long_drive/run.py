@@ -47,9 +47,11 @@ def draw(drive, online, done, path: Path) -> None:
 
     plot, (above, below) = common.pyplot().subplots(2, 1, figsize=(11, 5.5), layout="constrained")
     ends = np.asarray(done.endpoints_world)[done.lines.valid & ~done.lines.raised]
-    above.add_collection(LineCollection(ends, colors="#1f618d", lw=0.7))
-    above.plot(*common.in_start(drive.truth)[:, :2].T, color="black", lw=0.5)
-    above.set(xlabel="m", ylabel="m", aspect="equal", title="the smoothed map and the true way")
+    turned = lambda xy: np.stack([-xy[..., 1], xy[..., 0]], axis=-1)  # the rings beside each other
+    above.add_collection(LineCollection(turned(ends), colors="#1f618d", lw=0.7))
+    above.plot(*turned(common.in_start(drive.truth)).T, color="black", lw=0.5)
+    above.set(xlabel="m to the right", ylabel="m ahead", aspect="equal",
+              title="the smoothed map and the true way, in the frame of the start")  # fmt: skip
     way = np.append(0, np.cumsum(np.hypot(*np.diff(drive.truth.xy, axis=0).T)))
     for poses, label in ((online, "while driving"), (done.T_world_robot, "smoothed")):
         off = common.in_start(common.path_of(drive, poses)) - common.in_start(drive.truth)
