@@ -14,8 +14,8 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, segment_to_floor
 from sofjax.geometry.lines import (
     PolarLine,
+    alignment,
     normal,
-    polar_difference,
     polar_differences,
     polar_through,
 )
@@ -175,60 +175,63 @@ def compare(
     value is solved for (two unknowns, prior `tilt_sigma`) and the errors are taken about it.
 
     Written out in numbers over [M, N] instead of in 2×2 matrices for one pose under `vmap`: XLA
-    then makes loops of it that run over the particles, several times faster on a CPU. The scan over
-    the candidates also keeps it from working the poses out anew in each of those loops.
+    then makes loops of it that run over the particles, several times faster on a CPU. What the
+    normal equations of the tilt sum over the chosen candidates is linear in (1, x, y, yaw), and so
+    a product of matrices.
 
     **Arguments:**
     - `T_predicted_foot`: hypothetical feet [*poses] in the predicted foot's frame, in which the
-      candidates are given: near the origin, where the polar form is accurate.
+      candidates are given: near the origin, where the polar form is accurate, and turned by less
+      than a right angle.
     - `used`: which sightings may match, of each particle's own SoF extraction. The others cost
       e_max too: a pose must not win by taking nothing for floor.
     """
-    poses = T_predicted_foot.yaw.shape
-    of_poses = lambda tree: jax.tree.map(lambda a: a.reshape(*a.shape, *[1] * len(poses)), tree)
-    lines = (candidates.line, _nearing(candidates))
-    loose = _symmetric(candidates.precision_tilt)
-    by_candidate = jax.tree.map(lambda a: a.T, (lines, loose, candidates.valid))
+    poses, C = T_predicted_foot.yaw.shape, candidates.kappa.shape[1]
+    x, y, yaw = T_predicted_foot.xy[..., 0], T_predicted_foot.xy[..., 1], T_predicted_foot.yaw
+    of_poses = lambda a: a.reshape(*a.shape, *[1] * len(poses))
+    there = sightings.valid[:, None] & candidates.valid
+    d_rho, d_theta, by_x, by_y, loose, W = jax.tree.map(
+        lambda a: jnp.where(there, a, 0),
+        (*_differences(sightings, candidates), _symmetric(candidates.precision_tilt),
+         _symmetric(candidates.precision)),
+    )  # fmt: skip
 
-    def difference(line, nearing):
-        expected = _expected(line, nearing, T_predicted_foot)
-        return polar_differences(of_poses(sightings.line), expected)
+    def error(W, of, rho=0.0, theta=0.0):
+        moved = of(d_rho) + (of(by_x) * x + of(by_y) * y), of(d_theta) + yaw
+        return _quadratic([of(w) for w in W], moved[0] - rho, moved[1] - theta)
 
-    def nearer(best, candidate):
-        least, choice, c = best
-        line, W, valid = of_poses(candidate)
-        error = _quadratic(W, *difference(*line))
-        less = valid & (error < least)
-        return (jnp.where(less, error, least), jnp.where(less, c, choice), c + 1), None
+    least = jnp.full((len(there), *poses), sensor.e_max)
+    choice = jnp.full(least.shape, C)  # none
+    for c in range(C):
+        of_this = lambda a, c=c: of_poses(a[:, c])
+        e = jnp.where(of_this(there), error(loose, of_this), jnp.inf)
+        least, choice = jnp.where(e < least, e, least), jnp.where(e < least, c, choice)
+    choice = jnp.where(used, choice, C)
 
-    blank = jnp.zeros((*sightings.valid.shape, *poses))
-    best = blank + sensor.e_max, blank.astype(int), jnp.zeros((), int)
-    (least, choice, _), _ = jax.lax.scan(nearer, best, by_candidate)
-
-    def chosen(a):
-        value = of_poses(a[:, 0])
-        for c in range(1, a.shape[1]):
+    def of_choice(a):
+        value = jnp.zeros(())
+        for c in range(C):
             value = jnp.where(choice == c, of_poses(a[:, c]), value)
         return value
 
-    d_rho, d_theta = difference(*jax.tree.map(chosen, lines))
-    W = jax.tree.map(chosen, _symmetric(candidates.precision))
-    inlier = used & of_poses(sightings.valid) & (least < sensor.e_max)
-    d_rho, d_theta, *W = (jnp.where(inlier, a, 0) for a in (d_rho, d_theta, *W))
-    rho, theta = of_poses(jnp.moveaxis(sightings.tilt, 0, 2))  # by (pitch, roll), each [M]
-    JW = [(W[0] * r + W[1] * t, W[1] * r + W[2] * t) for r, t in zip(rho, theta, strict=True)]
-    gradient = [jnp.sum(r * d_rho + t * d_theta, axis=0) for r, t in JW]
-    information = [
-        jnp.sum(JW[i][0] * rho[j] + JW[i][1] * theta[j], axis=0)
-        for i, j in ((0, 0), (0, 1), (1, 1))
-    ]
-    tilt, _, prior = _solve_tilt(sensor, information, gradient)
+    J = jnp.where(sightings.valid[:, None, None], sightings.tilt, 0)
+    by_tilt = [(J[:, 0, k, None], J[:, 1, k, None]) for k in range(2)]  # pitch, roll
+    JW = [(W[0] * rho + W[1] * theta, W[1] * rho + W[2] * theta) for rho, theta in by_tilt]
+    A = [JW[i][0] * by_tilt[j][0] + JW[i][1] * by_tilt[j][1] for i, j in ((0, 0), (0, 1), (1, 1))]
+    b = [[r * d_rho + t * d_theta, r * by_x, r * by_y, t] for r, t in JW]
+    chosen = choice[:, None] == of_poses(jnp.arange(C))
+    sums = jnp.einsum(
+        "smc,mc...->s...", jnp.stack([*A, *b[0], *b[1]]), chosen.astype(float),
+        precision=jax.lax.Precision.HIGHEST,
+    )  # fmt: skip
+    gradient = [s[0] + s[1] * x + s[2] * y + s[3] * yaw for s in (sums[3:7], sums[7:])]
+    tilt, _, prior = _solve_tilt(sensor, sums[:3], gradient)
 
-    about = lambda d, J: d - (J[0] * tilt[0] + J[1] * tilt[1])
-    tight = _quadratic(W, about(d_rho, rho), about(d_theta, theta))
-    error = jnp.where(inlier, jnp.minimum(tight, sensor.e_max), sensor.e_max)
-    total = jnp.sum(jnp.where(of_poses(sightings.valid), error, 0), axis=0)
-    return Comparison(-0.5 * (total + prior), choice, error, tilt)
+    rho, theta = (of_poses(J[:, i, 0]) * tilt[0] + of_poses(J[:, i, 1]) * tilt[1] for i in range(2))
+    tight = jnp.minimum(error(W, of_choice, rho, theta), sensor.e_max)
+    tight = jnp.where(choice < C, tight, sensor.e_max)
+    total = jnp.sum(jnp.where(of_poses(sightings.valid), tight, 0), axis=0)
+    return Comparison(-0.5 * (total + prior), jnp.where(choice < C, choice, 0), tight, tilt)
 
 
 def log_density(
@@ -255,11 +258,10 @@ def log_density(
     - `log_elsewhere`: log density of a segment that is no line of the map, per pixel².
     """
     there = sightings.valid[:, None] & candidates.valid
-    observed = jax.tree.map(lambda a: a[:, None], sightings.line)
-    difference = polar_difference(
-        observed, _expected(candidates.line, _nearing(candidates), T_predicted_foot)
-    )
-    difference = jnp.where(there[..., None], difference, 0)
+    d_rho, d_theta, by_x, by_y = _differences(sightings, candidates)
+    x, y = T_predicted_foot.xy
+    moved = jnp.stack([d_rho + (by_x * x + by_y * y), d_theta + T_predicted_foot.yaw], axis=-1)
+    difference = jnp.where(there[..., None], moved, 0)
     log_area = jnp.where(sightings.valid, sightings.log_area, 0)[:, None]
     known = known[:, None]
     weights = jnp.concatenate([jnp.where(there, known / lines, 0), 1 - known], axis=1)
@@ -285,19 +287,17 @@ def log_density(
     return jnp.sum(jnp.where(sightings.valid, total, 0)) - 0.5 * (prior + jnp.log(volume))
 
 
-def _expected(line: PolarLine, nearing, T_predicted_foot: SE2) -> PolarLine:
-    """The candidates' lines as a hypothetical foot would see them.
+def _differences(sightings: Sightings, candidates: Candidates) -> tuple[Float[Array, "M C"], ...]:
+    """Observed less expected as the predicted foot would see it, and what moving the foot adds.
 
-    **Arguments:**
-    - `nearing`: what a metre along x and one along y take from rho, `_nearing(candidates)`.
+    **Returns:** the differences in rho and in theta, and what a metre along x and one along y add
+    to that in rho; a turn adds itself to that in theta.
     """
-    along = nearing[0] * T_predicted_foot.xy[..., 0] + nearing[1] * T_predicted_foot.xy[..., 1]
-    return PolarLine(line.rho - along, line.theta - T_predicted_foot.yaw)
-
-
-def _nearing(candidates: Candidates) -> tuple[Float[Array, "M C"], Float[Array, "M C"]]:
-    n = normal(candidates.line)
-    return candidates.kappa * n[..., 0], candidates.kappa * n[..., 1]
+    observed = jax.tree.map(lambda a: a[:, None], sightings.line)
+    d_rho, d_theta = polar_differences(observed, candidates.line)
+    nearing = (alignment(observed, candidates.line) * candidates.kappa)[..., None]
+    by_foot = nearing * normal(candidates.line)
+    return d_rho, d_theta, by_foot[..., 0], by_foot[..., 1]
 
 
 def _symmetric(W: Float[Array, "*batch 2 2"]) -> tuple[Array, Array, Array]:
