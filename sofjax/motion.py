@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
@@ -55,16 +55,16 @@ def _prior_sigma(model: MotionModel) -> Float[Array, "4"]:
 def sample_motion(
     model: MotionModel, bias: OdometerBias, odometer: SE2, key: PRNGKeyArray
 ) -> tuple[SE2, OdometerBias]:
-    """Draw one particle's motion and learn its systematic errors from the draw.
+    """Draw the motion of one particle or of many, and learn their systematic errors from the draw.
 
     The motion in distance and turn is z = u + A b + noise, where u is the reading; drawn from
     its marginal, it then updates b as a Kalman filter does.
 
     **Arguments:**
-    - `bias`: belief of one particle, `mean[4]`.
+    - `bias`: beliefs, `mean[*batch, 4]`.
     - `odometer`: T_previous_current as read, metres and radians.
 
-    **Returns:** T_previous_current drawn, and the belief given the draw.
+    **Returns:** T_previous_current drawn [*batch], and the beliefs given the draw.
     """
     forward, sideways, turn = odometer.log()  # along the arc, so that half a turn's error bends it
     distance = jnp.abs(forward)
@@ -81,54 +81,47 @@ def sample_motion(
     covariance = bias.covariance + wander
     S = A @ covariance @ A.T + noise  # diagonal: distance and turn share no error
     sigma = safe_sqrt(jnp.diag(S))
-    draw = jax.random.normal(key, (3,))
-    innovation = sigma * draw[:2]
-    moved, turned = jnp.stack([forward, turn]) + A @ bias.mean + innovation
-    slip = model.lateral_noise * safe_sqrt(distance) * draw[2]
+    # one draw for all: a key for each particle costs more than the rest of this
+    draw = jax.random.normal(key, (*bias.mean.shape[:-1], 3))
+    innovation = sigma * draw[..., :2]
+    moved = jnp.stack([forward, turn]) + bias.mean @ A.T + innovation
+    across = sideways + model.lateral_noise * safe_sqrt(distance) * draw[..., 2]
 
     gain = covariance @ A.T / jnp.where(sigma > 0, sigma, 1) ** 2
-    learned = OdometerBias(bias.mean + gain @ innovation, covariance - gain @ A @ covariance)
-    return SE2.exp(jnp.stack([moved, sideways + slip, turned])), learned
-
-
-def sample_motions(
-    model: MotionModel, bias: OdometerBias, odometer: SE2, keys: Key[Array, "N"]
-) -> tuple[SE2, OdometerBias]:
-    """`sample_motion` for all particles: means [N, 4] and keys [N], one covariance for all."""
-
-    def one(mean, key):
-        motion, learned = sample_motion(model, OdometerBias(mean, bias.covariance), odometer, key)
-        return motion, learned.mean, learned.covariance
-
-    motion, mean, covariance = jax.vmap(one, out_axes=(0, 0, None))(bias.mean, keys)
-    return motion, OdometerBias(mean, covariance)
+    learned = OdometerBias(bias.mean + innovation @ gain.T, covariance - gain @ A @ covariance)
+    return SE2.exp(jnp.stack([moved[..., 0], across, moved[..., 1]], axis=-1)), learned
 
 
 SLIPPED = 0.05  # share of the particles that try a slip
 
 
 def sample_slip(
-    model: MotionModel, odometer: SE2, testable: Bool[Array, ""], key: PRNGKeyArray
-) -> tuple[SE2, Float[Array, ""]]:
-    """What one particle supposes that the wheels reported and the robot did not do.
+    model: MotionModel,
+    odometer: SE2,
+    testable: Bool[Array, ""],
+    key: PRNGKeyArray,
+    shape: tuple[int, ...] = (),
+) -> tuple[SE2, Float[Array, "*shape"]]:
+    """What particles suppose that the wheels reported and the robot did not do.
 
     Slips are rare and large: many more particles try one than their rate says, and weigh less for
     it, so that without a sighting that tells nothing changes.
 
     **Arguments:**
     - `odometer`: T_previous_current as read; a robot that stands does not slip.
+    - `shape`: of the particles.
 
-    **Returns:** the motion to append to the reading's, mostly none, and the logarithm of its
-    importance weight.
+    **Returns:** the motion of each to append to the reading's, mostly none, and the logarithm of
+    its importance weight.
     """
     probability = jnp.minimum(model.slip_rate * jnp.abs(odometer.log()[0]), SLIPPED)
     possible = testable & (probability > 0)
     key_which, key_size = jax.random.split(key)
-    slips = possible & (jax.random.uniform(key_which) < SLIPPED)
-    forward, turn = jax.random.normal(key_size, (2,))
-    slip = jnp.stack([model.slip_distance * forward, jnp.zeros(()), model.slip_turn * turn])
+    slips = possible & (jax.random.uniform(key_which, shape) < SLIPPED)
+    sigma = jnp.stack([jnp.asarray(s, float) for s in (model.slip_distance, 0.0, model.slip_turn)])
+    slip = sigma * jax.random.normal(key_size, (*shape, 3))
     probability = jnp.where(possible, probability, SLIPPED)
     log_weight = jnp.where(
         slips, jnp.log(probability / SLIPPED), jnp.log1p(-probability) - jnp.log1p(-SLIPPED)
     )
-    return SE2.exp(jnp.where(slips, slip, 0)), jnp.where(possible, log_weight, 0)
+    return SE2.exp(jnp.where(slips[..., None], slip, 0)), jnp.where(possible, log_weight, 0)

@@ -18,7 +18,7 @@ from sofjax.likelihood import (
     pixels_and_weight,
     sight,
 )
-from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motions, sample_slip
+from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, sample_slip
 from sofjax.observation import Observation
 from sofjax.particles import (
     Particles,
@@ -153,11 +153,11 @@ def step(
     key, key_motion, key_slip, key_choice = jax.random.split(state.key, 4)
 
     # 1-3) move, and sample N particles by the motion model
-    motion, bias = sample_motions(
-        config.motion, state.particles.bias, observation.motion, jax.random.split(key_motion, N)
+    motion, bias = sample_motion(
+        config.motion, state.particles.bias, observation.motion, key_motion
     )
-    slip, log_ratio = jax.vmap(sample_slip, in_axes=(None, None, None, 0))(
-        config.motion, observation.motion, state.noise < SURE, jax.random.split(key_slip, N)
+    slip, log_ratio = sample_slip(
+        config.motion, observation.motion, state.noise < SURE, key_slip, (N,)
     )
     T_world_robot = state.particles.T_world_robot @ motion @ slip
     prior = state.particles.log_weight + log_ratio

@@ -13,7 +13,6 @@ from sofjax.motion import (
     OdometerBias,
     prior_bias,
     sample_motion,
-    sample_motions,
     sample_slip,
 )
 
@@ -22,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 UNBIASED = MotionModel(distance_scale_sigma=0.0, turn_scale_sigma=0.0, curvature_sigma=0.0)
 LOUD = MotionModel(distance_noise=0.03, lateral_noise=0.01, heading_noise=0.02, turn_noise=0.05)
 N = 20_000
-sample_all, sample_one = jit_quickly(sample_motions), jit_quickly(sample_motion)
+sample = jit_quickly(sample_motion)
 
 
 def reading(*twist):
@@ -33,11 +32,11 @@ def draws(model, odometer, mean=None):
     """Twists (forward, sideways, turn) of N particles, and what each has learned."""
     bias = prior_bias(model)
     means = jnp.broadcast_to(bias.mean if mean is None else jnp.array(mean, float), (N, 4))
-    motion, learned = sample_all(
+    motion, learned = sample(
         model,
         OdometerBias(means, bias.covariance),
         odometer,
-        jax.random.split(jax.random.key(1), N),
+        jax.random.key(1),
     )
     return np.asarray(motion.log()), learned
 
@@ -113,7 +112,7 @@ def test_what_was_learned_is_the_bayesian_regression_on_the_draws():
     weighted = np.zeros(4)
     for i in range(40):
         forward, turn = rng.uniform(-0.1, 0.5), rng.uniform(-0.5, 0.5)
-        motion, belief = sample_one(model, belief, reading(forward, 0.0, turn), jax.random.key(i))
+        motion, belief = sample(model, belief, reading(forward, 0.0, turn), jax.random.key(i))
         moved, _, turned = np.asarray(motion.log())
         A = np.array([[forward, 0, 0, 0], [0, max(turn, 0), min(turn, 0), abs(forward)]])
         W = np.diag(1 / np.array([
@@ -144,7 +143,7 @@ def test_a_left_turn_teaches_nothing_about_right_turns_nor_a_turn_about_distance
 def test_systematic_errors_wander_with_the_way():
     """A belief far below its prior grows again by its drift, when the noise teaches nothing."""
     model = MotionModel(1e6, 0.0, 1e6, 1e6, 0.02, 0.05, 0.005, bias_drift=0.5)
-    _, learned = sample_one(
+    _, learned = sample(
         model,
         OdometerBias(jnp.zeros(4), jnp.zeros((4, 4))),
         reading(2.0, 0.0, 0.1),
@@ -156,35 +155,32 @@ def test_systematic_errors_wander_with_the_way():
 
 def test_all_particles_share_one_covariance_whatever_they_drew():
     bias = prior_bias(LOUD)
-    learned = [
-        sample_one(LOUD, bias, reading(0.5, 0.0, 0.3), jax.random.key(i))[1] for i in range(3)
-    ]
+    learned = [sample(LOUD, bias, reading(0.5, 0.0, 0.3), jax.random.key(i))[1] for i in range(3)]
     for other in learned[1:]:
         np.testing.assert_array_equal(other.covariance, learned[0].covariance)
         assert (other.mean != learned[0].mean).any()
 
 
-def test_many_particles_are_each_drawn_by_its_own_key():
-    keys = jax.random.split(jax.random.key(5), 4)
+def test_many_particles_are_each_drawn_from_their_own_belief():
+    """All means alike but one: with the same key only that particle's motion differs."""
     bias = prior_bias(LOUD)
-    means = jnp.arange(16.0).reshape(4, 4) / 1000
-    motion, learned = sample_all(
-        LOUD, OdometerBias(means, bias.covariance), reading(0.5, 0.0, 0.3), keys
+    odometer, key = reading(0.5, 0.0, 0.3), jax.random.key(5)
+    alike = jnp.zeros((4, 4))
+    of = lambda means: sample(LOUD, OdometerBias(means, bias.covariance), odometer, key)
+    (motion, learned), (other, other_learned) = of(alike), of(alike.at[2].set(0.01))
+    same = np.array([True, True, False, True])
+    np.testing.assert_array_equal((motion.yaw == other.yaw), same)
+    np.testing.assert_array_equal((motion.xy == other.xy).all(axis=1), same)
+    np.testing.assert_allclose(
+        other_learned.mean - learned.mean, np.where(same, 0, 0.01)[:, None] * np.ones(4)
     )
-    for i in range(4):
-        alone, learned_alone = sample_one(
-            LOUD, OdometerBias(means[i], bias.covariance), reading(0.5, 0.0, 0.3), keys[i]
-        )
-        np.testing.assert_allclose(motion.xy[i], alone.xy)
-        np.testing.assert_allclose(motion.yaw[i], alone.yaw)
-        np.testing.assert_allclose(learned.mean[i], learned_alone.mean)
+    assert len(np.unique(motion.yaw)) == 4
 
 
 def slips(model, odometer, testable=True):
     """Twists of N particles, and their importance weights."""
-    each = jax.vmap(sample_slip, in_axes=(None, None, None, 0))
-    slip, log_weight = jax.jit(each)(
-        model, odometer, jnp.array(testable), jax.random.split(jax.random.key(2), N)
+    slip, log_weight = jax.jit(sample_slip, static_argnums=4)(
+        model, odometer, jnp.array(testable), jax.random.key(2), (N,)
     )
     return np.asarray(slip.log()), np.exp(np.asarray(log_weight))
 
