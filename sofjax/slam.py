@@ -217,7 +217,7 @@ def step(
     new = is_sof & (nearest > sensor.e_max) & counted & ~known
     segment_map, overflow = integrate(
         rules, sensor, state.segment_map, near, sightings,
-        jnp.take_along_axis(at, best.choice[:, None], 1)[:, 0],
+        jnp.take_along_axis(at, best.choice[:, None], 1)[:, 0], at,
         known, new, best.tilt,
         in_view(rules, camera, mount, lines, chosen), T_world_foot_chosen,
     )  # fmt: skip

@@ -35,6 +35,11 @@ STIFF = SensorModel(tilt_sigma=0.0)
 grow, proposals = jit_quickly(integrate), jit_quickly(propose)
 
 
+def everything(L):
+    """Any line may be the same once more."""
+    return jnp.broadcast_to(jnp.arange(L), (M, L))
+
+
 def pose(x=0.0, y=0.0, yaw=0.0):
     return SE2(jnp.array([x, y], float), jnp.array(yaw, float))
 
@@ -62,7 +67,7 @@ def see(segment_map, *ends, at=None, slots=None, rules=GAMMA, sigma=0.01, view=(
     new = sightings.valid & ~known
     shown = jnp.zeros(K, bool).at[jnp.array(view, int)].set(True)
     return grow(
-        rules, STIFF, segment_map, jnp.arange(K), sightings, slot, known, new,
+        rules, STIFF, segment_map, jnp.arange(K), sightings, slot, everything(K), known, new,
         jnp.zeros(2), shown, at,
     )  # fmt: skip
 
@@ -209,8 +214,8 @@ def test_correlated_errors_turn_with_the_name_when_a_line_is_updated():
     known = jnp.arange(M) < 1
     there, back = (
         grow(
-            KALMAN, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), known, ~known & s.valid,
-            jnp.zeros(2), jnp.zeros(K, bool), pose(),
+            KALMAN, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), everything(K), known,
+            ~known & s.valid, jnp.zeros(2), jnp.zeros(K, bool), pose(),
         )[0]
         for s in named_both_ways()
     )  # fmt: skip
@@ -534,7 +539,7 @@ def test_a_wobble_is_taken_out_of_what_is_integrated():
     m = seen(empty_map(GAMMA), across(1.0))
     known = jnp.arange(M) < 1
     after, _ = grow(
-        GAMMA, STIFF, m, jnp.arange(K), sightings, jnp.zeros(M, int), known,
+        GAMMA, STIFF, m, jnp.arange(K), sightings, jnp.zeros(M, int), everything(K), known,
         ~known & sightings.valid, jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
     )  # fmt: skip
     assert offset(after) == pytest.approx(1.0)
@@ -659,8 +664,8 @@ def test_lines_beyond_those_nearby_only_age():
     np.testing.assert_array_equal(near, [0, 1])
     known = jnp.arange(M) < 1
     after, _ = jit_quickly(integrate)(
-        rules, STIFF, m, near, sightings_of(across(2.2)), jnp.ones(M, int), known, ~known & known,
-        jnp.zeros(2), jnp.zeros(2, bool), pose(),
+        rules, STIFF, m, near, sightings_of(across(2.2)), jnp.ones(M, int), everything(len(near)),
+        known, ~known & known, jnp.zeros(2), jnp.zeros(2, bool), pose(),
     )  # fmt: skip
     np.testing.assert_array_equal(after.updates[:3], [1, 2, 1])
     np.testing.assert_array_equal(

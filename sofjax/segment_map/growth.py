@@ -31,6 +31,7 @@ def integrate(
     near: Int[Array, "L"],
     sightings: Sightings,
     at: Int[Array, "M"],
+    like: Int[Array, "M C"],
     known: Bool[Array, "M"],
     new: Bool[Array, "M"],
     tilt: Float[Array, "2"],
@@ -42,6 +43,7 @@ def integrate(
     **Arguments:**
     - `near`: slots of the lines that this image may show, of `nearby`; the others only age.
     - `at`, `known`: which of them each sighting is, if any.
+    - `like`: those most like each sighting, of `propose`: one may be the same line once more.
     - `new`: sightings that begin a line.
     - `tilt`: wobble (pitch, roll) to correct the sightings for.
     - `in_view`: which of them this image should show, of `in_view`.
@@ -51,7 +53,7 @@ def integrate(
     """
     some = segment_map.take(near)
     some = _update(rules, sensor, some, sightings, at, known, tilt, in_view, T_world_foot)
-    some = _merge(rules, some, at, known)
+    some = _merge(rules, some, at, like, known)
     segment_map = _age(segment_map, sightings).put(near, some)
     segment_map, overflow = _insert(rules, segment_map, sightings, new, tilt, T_world_foot)
     return _forget(rules, segment_map), overflow
@@ -210,7 +212,7 @@ def _insert(rules, m, sightings, new, tilt, T_world_foot):
     ), overflow
 
 
-def _merge(rules, m, at, known):
+def _merge(rules, m, at, like, known):
     """A line just seen joins an older one that it doubles: the older one's place, both extents."""
     L = m.updates.shape[0]
     ends = m.segments_world.endpoints
@@ -218,23 +220,22 @@ def _merge(rules, m, at, known):
     n = normal(line)
     raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
 
-    mine = ends[at][:, None]
-    off = lambda x: jnp.abs(x[..., 0] * n[:, 0] + x[..., 1] * n[:, 1] - line.rho)
-    turn = (wrap if rules.directed else wrap_axial)(line.theta[at][:, None] - line.theta)
-    gap = -overlap(mine, ends)
-    older = (m.updates > m.updates[at][:, None]) | (
-        (m.updates == m.updates[at][:, None]) & (jnp.arange(L) < at[:, None])
-    )
+    mine, me = ends[at][:, None], at[:, None]
+    n_like, rho_like = n[like], line.rho[like]
+    off = lambda x: jnp.abs(x[..., 0] * n_like[..., 0] + x[..., 1] * n_like[..., 1] - rho_like)
+    turn = (wrap if rules.directed else wrap_axial)(line.theta[me] - line.theta[like])
+    gap = -overlap(mine, ends[like])
+    older = (m.updates[like] > m.updates[me]) | ((m.updates[like] == m.updates[me]) & (like < me))
     double = (
         (jnp.maximum(off(mine[:, :, 0]), off(mine[:, :, 1])) < rules.merge_distance)
         & (jnp.abs(turn) < rules.merge_angle)
         & (gap < rules.join_gap)
-        & (raised == raised[at][:, None])
+        & (raised[like] == raised[me])
         & older
-        & m.valid
+        & m.valid[like]
         & (known & m.valid[at])[:, None]
     )
-    into = jnp.where(double, jnp.arange(L), L).min(axis=1)  # the first of them; read but once
+    into = jnp.where(double, like, L).min(axis=1)  # the first of them
     doubles, first = into < L, jnp.minimum(into, L - 1)
     dying = jnp.zeros(L, bool).at[at].max(doubles)
     joins = doubles & ~dying[first]
