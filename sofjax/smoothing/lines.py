@@ -51,6 +51,7 @@ class Seeing(eqx.Module):
     gate: float = 3.0  # pixels that an end may be off its line
     angle: float = 0.15  # radians between a segment and its line in the image
     join_gap: float = 0.1  # metres that a segment may lie beyond what was seen of its line
+    upright: float = 1.0  # pixels that an end may be off a line through the foot: may be upright
 
 
 def associate(
@@ -61,6 +62,9 @@ def associate(
 
     **Arguments:**
     - `max_depth`: metres; what is farther is not used.
+
+    An upright edge, of a door or a box, always points to the foot, and from a short way looks like
+    a line of the floor: what points there shows no line.
 
     **Returns:** the line's index, and whether there is one within the gates.
     """
@@ -91,14 +95,27 @@ def associate(
             & (jnp.abs(first - second) < seeing.angle * length)
             & (shared(apparent, on_floor) > -seeing.join_gap)
             & there
-            & (valid & some)[:, None]
-        )
+            & (valid & some & ~jax.vmap(_points_to, in_axes=(0, None, None))(
+                endpoints, H_F[:, 2], seeing.upright
+            ))[:, None]
+        )  # fmt: skip
         off = jnp.where(possible, first**2 + second**2, jnp.inf)
         return near[off.argmin(axis=1)], possible.any(axis=1)
 
     return jax.lax.map(
         of_keyframe, (unknowns.pose, segments_image.endpoints, segments_image.valid), batch_size=8
     )
+
+
+def _points_to(
+    segment: Float[Array, "2 2"], place: Float[Array, "3"], gate: Float[Array, ""] | float
+) -> Bool[Array, ""]:
+    """Whether the ends are within `gate` of the line through a place (homogeneous) and the middle.
+
+    Both in pixels.
+    """
+    line = jnp.cross(place, jnp.append(segment.mean(axis=0), 1))
+    return jnp.abs(line_point_distance(line, segment[0])) < gate
 
 
 def _from_origin(ends: Float[Array, "2 2"]) -> Float[Array, ""]:
