@@ -23,6 +23,7 @@ class Lines(eqx.Module):
     reach: Float[Array, "K 2"]  # first and last place along the line, metres from the anchor
     raised: Bool[Array, "K"]  # not on the floor: kappa is free
     valid: Bool[Array, "K"]
+    span: Float[Array, "K 2"]  # metres of the way driven between which each may be seen
 
     @property
     def endpoints_world(self) -> Float[Array, "K 2 2"]:
@@ -39,7 +40,8 @@ def lines_of(
     """Lines whose reach is that of segments along them."""
     local = jax.vmap(lambda T, e: T.inverse().apply(e))(anchor, endpoints_world)
     along = jnp.einsum("kij,kj->ki", local, direction(PolarLine(line[:, 0], line[:, 1])))
-    return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid)
+    always = jnp.broadcast_to(jnp.array([-jnp.inf, jnp.inf], line.dtype), along.shape)
+    return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid, always)
 
 
 NEAREST = 256  # lines about a keyframe that its segments may show
@@ -56,12 +58,13 @@ class Seeing(eqx.Module):
 
 def associate(
     seeing: Seeing, max_depth: Float[Array, ""] | float, camera: Camera, mount: Mount,
-    lines: Lines, unknowns: Unknowns, segments_image: Segments,
+    lines: Lines, unknowns: Unknowns, segments_image: Segments, driven: Float[Array, "n"],
 ) -> tuple[Int[Array, "n M"], Bool[Array, "n M"]]:  # fmt: skip
     """For each segment of each keyframe the line that lies nearest to both of its ends, in pixels.
 
     **Arguments:**
     - `max_depth`: metres; what is farther is not used.
+    - `driven`: metres, at each keyframe.
 
     An upright edge, of a door or a box, always points to the foot, and from a short way looks like
     a line of the floor: what points there shows no line.
@@ -72,14 +75,15 @@ def associate(
     K, ends_world = lines.valid.shape[0], lines.endpoints_world
 
     def of_keyframe(each):
-        pose, endpoints, valid = each
+        pose, endpoints, valid, driven = each
         T_world_foot = SE2(pose[:2], pose[2]) @ mount.T_robot_foot
         H_F = floor_homography(camera, foot_mount(mount, pose), SE2.identity())
         seen, _ = jax.vmap(appear, in_axes=(0, 0, None))(lines.line, lines.anchor, T_world_foot)
         apparent = T_world_foot.inverse().apply(ends_world) * seen[:, 2, None, None]
-        far = jnp.where(lines.valid, jax.vmap(_from_origin)(apparent), jnp.inf)
+        there = lines.valid & (lines.span[:, 0] <= driven) & (driven <= lines.span[:, 1])
+        far = jnp.where(there, jax.vmap(_from_origin)(apparent), jnp.inf)
         near = jax.lax.top_k(-far, min(K, NEAREST))[1]
-        seen, apparent, there = seen[near], apparent[near], lines.valid[near]
+        seen, apparent, there = seen[near], apparent[near], there[near]
         n = normal(PolarLine(seen[:, 0], seen[:, 1]))
         l = jnp.concatenate([n, -seen[:, :1]], axis=1) @ cofactor(H_F).T
         distance = jax.vmap(jax.vmap(line_point_distance, in_axes=(0, None)), in_axes=(None, 0))
@@ -102,9 +106,8 @@ def associate(
         off = jnp.where(possible, first**2 + second**2, jnp.inf)
         return near[off.argmin(axis=1)], possible.any(axis=1)
 
-    return jax.lax.map(
-        of_keyframe, (unknowns.pose, segments_image.endpoints, segments_image.valid), batch_size=8
-    )
+    each = (unknowns.pose, segments_image.endpoints, segments_image.valid, driven)
+    return jax.lax.map(of_keyframe, each, batch_size=8)
 
 
 def _points_to(

@@ -20,11 +20,14 @@ from sofjax.smoothing.dissection import Dissection, dissect, divide
 from sofjax.smoothing.extents import reaches
 from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
 from sofjax.smoothing.merging import doubles, representatives
-from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, misfit
+from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, distances, misfit
 from sofjax.smoothing.solution import TOLERANCE, Solution, solve
 
 ROUGH = 2e-3  # metres and radians to which poses settle in rounds that are not the last
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
+
+
+BENT = 2.0
 
 
 class SmoothingRules(eqx.Module):
@@ -38,6 +41,7 @@ class SmoothingRules(eqx.Module):
     min_sightings: int = 3  # keyframes that a line takes
     room: int = eqx.field(static=True, default=kf.PAD)  # least sizes of what is compiled
     kappa_known: float = 0.03  # standard deviation below which a line may be one of the final map
+    passing: float = 10.0  # metres driven after which what is seen again is told anew
     seeing: Seeing = Seeing()
 
 
@@ -109,11 +113,16 @@ def smooth(
         )
         costs, merged, dissection = [], 0, None
         leaf = divide(np.asarray(start.pose[:, :2]))
+        import os
+        known = rules.kappa_known if "C" in os.environ["V"] else jnp.asarray(1e9)
+        problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
+        problem, lines = _apart(rules, problem, lines)
         for left in reversed(range(rules.rounds)):
-            problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
+            if left < rules.rounds - 1:
+                problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
             dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
             tolerance = ROUGH if left else TOLERANCE
-            problem, lines, solution = _solved(config, problem, lines, dissection, tolerance)
+            problem, lines, solution = _solved(config, known, problem, lines, dissection, tolerance)
             costs.append((float(solution.cost_before), float(solution.cost)))
             into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
             if joins.any():
@@ -121,9 +130,13 @@ def smooth(
                 problem, lines = _renamed(problem, lines, representatives(into, joins))
                 dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
                 problem, lines, solution = _solved(
-                    config, problem, lines, dissection, tolerance, sure=left == 0
+                    config, known, problem, lines, dissection, tolerance, sure=left == 0
                 )
                 costs.append((float(solution.cost_before), float(solution.cost)))
+            if left and "D" in os.environ["V"]:
+                valid = _straight(problem, lines)
+                print("dropped", int((lines.valid & ~valid).sum()), "of", int(lines.valid.sum()))
+                lines = eqx.tree_at(lambda l: l.valid, lines, valid)
         pose = problem.start.pose
         return jax.device_get(
             Smoothed(
@@ -190,7 +203,7 @@ def _associated(
     """With the lines that the segments of `frames` show by the present estimate, and only those."""
     line, known = _shown(
         seeing, max_depth, problem.camera, problem.mount, lines, problem.start,
-        frames.segments_image,
+        frames.segments_image, frames.driven,
     )  # fmt: skip
     frames = eqx.tree_at(lambda f: (f.line, f.known), frames, (line, known))
     most = int(known.sum(axis=1).max())
@@ -206,21 +219,67 @@ _narrowed = jax.jit(kf.narrowed, static_argnums=1)
 _shown = jax.jit(associate)
 
 
+def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Problem, Lines]:
+    """What is seen again after `rules.passing` metres is another line until it is found to be one.
+
+    Where the drive has drifted by as much as two edges are apart, a segment is taken for the
+    other edge, and so are all beside it: no solution comes back from there.
+    """
+    frames = problem.keyframes
+    driven, known = np.asarray(frames.driven), np.asarray(frames.known)
+    image, slot = np.nonzero(known)
+    old = np.asarray(frames.line)[image, slot]
+    order = np.lexsort((image, old))
+    image, slot, old = image[order], slot[order], old[order]
+    first = np.diff(old, prepend=-1) != 0
+    begins = first | (np.diff(driven[image], prepend=0) > rules.passing)
+    group = np.cumsum(begins) - 1
+    parent, is_first, count = old[begins], first[begins], np.bincount(group)
+    enough = count >= int(rules.min_sightings)
+    more = ~is_first & enough
+    live = int(lines.valid.sum())
+    name = np.where(more, live + np.cumsum(more) - 1, parent)
+    size = kf.padded(max(live + more.sum(), 1), rules.room)
+    source = np.concatenate([np.arange(live), parent[more]])
+    source = np.concatenate([source, np.zeros(size - len(source), int)])
+    valid = np.arange(size) < live + more.sum()
+    span = np.tile([-np.inf, np.inf], (size, 1))
+    ends = np.append(np.flatnonzero(begins)[1:], len(old)) - 1
+    span[name[enough], 0] = driven[image[begins]][enough] - rules.passing / 2
+    span[name[enough], 1] = driven[image[ends]][enough] + rules.passing / 2
+    line, seen = np.array(frames.line), known.copy()
+    line[image, slot] = name[group]
+    seen[image, slot] = enough[group]
+    take = lambda a: a[source]
+    lines = eqx.tree_at(
+        lambda l: (l.valid, l.span, l.raised),
+        jax.tree.map(take, lines),
+        (jnp.asarray(valid), jnp.asarray(span), take(lines.raised) | (np.arange(size) >= live)),
+    )
+    problem = eqx.tree_at(
+        lambda p: (p.anchor, p.raised, p.start.line, p.keyframes.line, p.keyframes.known),
+        problem,
+        (lines.anchor, lines.raised, lines.line, jnp.asarray(line), jnp.asarray(seen)),
+    )
+    return problem, lines
+
+
 def _solved(
-    config, problem: Problem, lines: Lines, dissection: Dissection, tolerance: float, sure=True
+    config, known, problem: Problem, lines: Lines, dissection: Dissection, tolerance, sure=True
 ):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
     solution = solve(problem, dissection, sure=sure, tolerance=tolerance)
-    return *_settled(config, problem, lines, solution), solution
+    return *_settled(config, known, problem, lines, solution), solution
 
 
 @jax.jit
-def _settled(config, problem, lines, solution):
+def _settled(config, known, problem, lines, solution):
     rules = config.segment_map
     kappa, sigma = solution.kappa_free, solution.kappa_sigma
     outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
     raised = outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
+    raised = raised | (sigma > known)
     line = solution.unknowns.line
     line = line.at[:, 2].set(jnp.where(raised, line[:, 2], 1))
     unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
@@ -230,15 +289,34 @@ def _settled(config, problem, lines, solution):
     problem = eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
     reach, seen = reaches(problem, rules.range)
     reach = jnp.where(seen[:, None], reach, lines.reach)
-    return problem, Lines(lines.anchor, line, reach, raised, lines.valid)
+    return problem, Lines(lines.anchor, line, reach, raised, lines.valid, lines.span)
 
 
 def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
     """Lines that are one go on as one: their segments show it, and its reach is that of all."""
     line = problem.keyframes.line
-    lines = eqx.tree_at(lambda l: l.valid, lines, lines.valid & (name == np.arange(len(name))))
+    K = len(name)
+    span = jnp.stack([
+        lines.span[:, 0].at[name].min(lines.span[:, 0]),
+        lines.span[:, 1].at[name].max(lines.span[:, 1]),
+    ], axis=1)  # fmt: skip
+    lines = eqx.tree_at(
+        lambda l: (l.valid, l.span), lines, (lines.valid & (name == np.arange(K)), span)
+    )
     line = jnp.asarray(name, line.dtype)[line]  # of the type that `_solve` was compiled for
     return eqx.tree_at(lambda p: p.keyframes.line, problem, line), lines
+
+
+@jax.jit
+def _straight(problem: Problem, lines: Lines):
+    """Lines but for those that misfit what was seen of them much more than others do."""
+    frames, K = problem.keyframes, lines.valid.shape[0]
+    count = _sightings(frames, lines)
+    square = (distances(problem.start, problem) ** 2).sum(axis=2)
+    total = jnp.zeros(K).at[jnp.where(frames.known, frames.line, K)].add(square, mode="drop")
+    misfit = total / jnp.maximum(2 * count - 2, 1)
+    usual = jnp.nanmedian(jnp.where(lines.valid & (count > 2), misfit, jnp.nan))
+    return lines.valid & ~(misfit > BENT**2 * usual)
 
 
 @jax.jit
