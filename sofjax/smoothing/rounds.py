@@ -27,8 +27,7 @@ ROUGH = 2e-3  # metres and radians to which poses settle in rounds that are not 
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
 
 
-BENT = 2.0
-
+BENT = 2.0  # times the usual misfit, root mean square, that no one line has
 
 class SmoothingRules(eqx.Module):
     """When a drive is smoothed, and how."""
@@ -113,8 +112,6 @@ def smooth(
         )
         costs, merged, dissection = [], 0, None
         leaf = divide(np.asarray(start.pose[:, :2]))
-        import os
-        known = rules.kappa_known if "C" in os.environ["V"] else jnp.asarray(1e9)
         problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
         problem, lines = _apart(rules, problem, lines)
         for left in reversed(range(rules.rounds)):
@@ -122,21 +119,21 @@ def smooth(
                 problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
             dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
             tolerance = ROUGH if left else TOLERANCE
-            problem, lines, solution = _solved(config, known, problem, lines, dissection, tolerance)
+            problem, lines, solution = _solved(
+                config, rules.kappa_known, problem, lines, dissection, tolerance
+            )
             costs.append((float(solution.cost_before), float(solution.cost)))
+            problem, lines, bent = _straight(problem, lines)
             into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
-            if joins.any():
+            if bent or joins.any():
                 merged += int(joins.sum())
                 problem, lines = _renamed(problem, lines, representatives(into, joins))
                 dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
                 problem, lines, solution = _solved(
-                    config, known, problem, lines, dissection, tolerance, sure=left == 0
+                    config, rules.kappa_known, problem, lines, dissection, tolerance,
+                    sure=left == 0,
                 )
                 costs.append((float(solution.cost_before), float(solution.cost)))
-            if left and "D" in os.environ["V"]:
-                valid = _straight(problem, lines)
-                print("dropped", int((lines.valid & ~valid).sum()), "of", int(lines.valid.sum()))
-                lines = eqx.tree_at(lambda l: l.valid, lines, valid)
         pose = problem.start.pose
         return jax.device_get(
             Smoothed(
@@ -309,14 +306,19 @@ def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
 
 @jax.jit
 def _straight(problem: Problem, lines: Lines):
-    """Lines but for those that misfit what was seen of them much more than others do."""
+    """Without the lines that misfit what was seen of them much more than others do, and whether
+    there were any: no one straight line is what they show.
+    """
     frames, K = problem.keyframes, lines.valid.shape[0]
     count = _sightings(frames, lines)
     square = (distances(problem.start, problem) ** 2).sum(axis=2)
     total = jnp.zeros(K).at[jnp.where(frames.known, frames.line, K)].add(square, mode="drop")
     misfit = total / jnp.maximum(2 * count - 2, 1)
     usual = jnp.nanmedian(jnp.where(lines.valid & (count > 2), misfit, jnp.nan))
-    return lines.valid & ~(misfit > BENT**2 * usual)
+    bent = lines.valid & (misfit > BENT**2 * usual)
+    known = frames.known & ~bent[frames.line]
+    problem = eqx.tree_at(lambda p: p.keyframes.known, problem, known)
+    return problem, eqx.tree_at(lambda l: l.valid, lines, lines.valid & ~bent), bent.any()
 
 
 @jax.jit
