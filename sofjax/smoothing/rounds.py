@@ -20,14 +20,21 @@ from sofjax.smoothing.dissection import Dissection, dissect, divide
 from sofjax.smoothing.extents import reaches
 from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
 from sofjax.smoothing.merging import doubles, representatives
-from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, distances, misfit
+from sofjax.smoothing.problem import (
+    Keyframes,
+    Priors,
+    Problem,
+    Unknowns,
+    corrected,
+    distances,
+    misfit,
+)
 from sofjax.smoothing.solution import TOLERANCE, Solution, solve
 
 ROUGH = 2e-3  # metres and radians to which poses settle in rounds that are not the last
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
-
-
 BENT = 2.0  # times the usual misfit, root mean square, that no one line has
+
 
 class SmoothingRules(eqx.Module):
     """When a drive is smoothed, and how."""
@@ -119,9 +126,7 @@ def smooth(
                 problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
             dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
             tolerance = ROUGH if left else TOLERANCE
-            problem, lines, solution = _solved(
-                config, rules.kappa_known, problem, lines, dissection, tolerance
-            )
+            problem, lines, solution = _solved(config, rules, problem, lines, dissection, tolerance)
             costs.append((float(solution.cost_before), float(solution.cost)))
             problem, lines, bent = _straight(problem, lines)
             into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
@@ -130,8 +135,7 @@ def smooth(
                 problem, lines = _renamed(problem, lines, representatives(into, joins))
                 dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
                 problem, lines, solution = _solved(
-                    config, rules.kappa_known, problem, lines, dissection, tolerance,
-                    sure=left == 0,
+                    config, rules, problem, lines, dissection, tolerance, sure=left == 0
                 )
                 costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
@@ -219,64 +223,66 @@ _shown = jax.jit(associate)
 def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Problem, Lines]:
     """What is seen again after `rules.passing` metres is another line until it is found to be one.
 
-    Where the drive has drifted by as much as two edges are apart, a segment is taken for the
-    other edge, and so are all beside it: no solution comes back from there.
+    Where a drive has drifted by as much as two edges are apart, as the foot and the top of a
+    baseboard, each is taken for the other and so are all beside them: no solution leads back.
     """
     frames = problem.keyframes
-    driven, known = np.asarray(frames.driven), np.asarray(frames.known)
-    image, slot = np.nonzero(known)
-    old = np.asarray(frames.line)[image, slot]
-    order = np.lexsort((image, old))
-    image, slot, old = image[order], slot[order], old[order]
-    first = np.diff(old, prepend=-1) != 0
-    begins = first | (np.diff(driven[image], prepend=0) > rules.passing)
-    group = np.cumsum(begins) - 1
-    parent, is_first, count = old[begins], first[begins], np.bincount(group)
-    enough = count >= int(rules.min_sightings)
-    more = ~is_first & enough
-    live = int(lines.valid.sum())
-    name = np.where(more, live + np.cumsum(more) - 1, parent)
-    size = kf.padded(max(live + more.sum(), 1), rules.room)
-    source = np.concatenate([np.arange(live), parent[more]])
-    source = np.concatenate([source, np.zeros(size - len(source), int)])
-    valid = np.arange(size) < live + more.sum()
+    driven, known, name = map(np.array, (frames.driven, frames.known, frames.line))
+    at = np.nonzero(known)
+    order = np.lexsort((at[0], name[at]))
+    at = at[0][order], at[1][order]
+    old, way = name[at], driven[at[0]]
+    is_first = np.diff(old, prepend=-1) != 0
+    begins = is_first | (np.diff(way, prepend=0) > float(rules.passing))
+    parent, group, ends = old[begins], np.cumsum(begins) - 1, np.roll(begins, -1)
+    enough = np.bincount(group, minlength=len(parent)) >= int(rules.min_sightings)
+    more = enough & ~is_first[begins]
+
+    count = int(lines.valid.sum())  # these come first
+    new = np.where(more, count + np.cumsum(more) - 1, parent)
+    total = count + int(more.sum())
+    size = kf.padded(max(total, 1), rules.room)
+    source = np.zeros(size, int)
+    source[:total] = np.append(np.arange(count), parent[more])
     span = np.tile([-np.inf, np.inf], (size, 1))
-    ends = np.append(np.flatnonzero(begins)[1:], len(old)) - 1
-    span[name[enough], 0] = driven[image[begins]][enough] - rules.passing / 2
-    span[name[enough], 1] = driven[image[ends]][enough] + rules.passing / 2
-    line, seen = np.array(frames.line), known.copy()
-    line[image, slot] = name[group]
-    seen[image, slot] = enough[group]
-    take = lambda a: a[source]
+    span[new[enough]] = np.stack([way[begins], way[ends]], axis=1)[enough]
+    span += rules.passing / 2 * np.array([-1, 1])
+    name[at], known[at] = new[group], enough[group]
+
+    lines = jax.tree.map(lambda a: a[source], lines)
     lines = eqx.tree_at(
-        lambda l: (l.valid, l.span, l.raised),
-        jax.tree.map(take, lines),
-        (jnp.asarray(valid), jnp.asarray(span), take(lines.raised) | (np.arange(size) >= live)),
+        lambda l: (l.raised, l.valid, l.span),
+        lines,
+        (
+            lines.raised | (np.arange(size) >= count),
+            jnp.arange(size) < total,
+            jnp.asarray(span),
+        ),
     )
     problem = eqx.tree_at(
-        lambda p: (p.anchor, p.raised, p.start.line, p.keyframes.line, p.keyframes.known),
+        lambda p: (p.start.line, p.keyframes.line, p.keyframes.known),
         problem,
-        (lines.anchor, lines.raised, lines.line, jnp.asarray(line), jnp.asarray(seen)),
+        (lines.line, jnp.asarray(name), jnp.asarray(known)),
     )
     return problem, lines
 
 
 def _solved(
-    config, known, problem: Problem, lines: Lines, dissection: Dissection, tolerance, sure=True
+    config, rules, problem: Problem, lines: Lines, dissection: Dissection, tolerance, sure=True
 ):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
     solution = solve(problem, dissection, sure=sure, tolerance=tolerance)
-    return *_settled(config, known, problem, lines, solution), solution
+    return *_settled(config, rules, problem, lines, solution), solution
 
 
 @jax.jit
-def _settled(config, known, problem, lines, solution):
-    rules = config.segment_map
+def _settled(config, rules, problem, lines, solution):
+    m = config.segment_map
     kappa, sigma = solution.kappa_free, solution.kappa_sigma
-    outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
-    raised = outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
-    raised = raised | (sigma > known)
+    outside = (kappa > m.kappa_above) | (kappa < m.kappa_below)
+    # what is not known to be the floor's, as of a baseboard passed by, must not hold the poses
+    raised = (outside & (jnp.abs(kappa - 1) > m.kappa_gate * sigma)) | (sigma > rules.kappa_known)
     line = solution.unknowns.line
     line = line.at[:, 2].set(jnp.where(raised, line[:, 2], 1))
     unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
@@ -284,40 +290,34 @@ def _settled(config, known, problem, lines, solution):
     # believe the pixels less where they disagree more than they should
     sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
     problem = eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
-    reach, seen = reaches(problem, rules.range)
+    reach, seen = reaches(problem, m.range)
     reach = jnp.where(seen[:, None], reach, lines.reach)
     return problem, Lines(lines.anchor, line, reach, raised, lines.valid, lines.span)
 
 
 def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
     """Lines that are one go on as one: their segments show it, and its reach is that of all."""
-    line = problem.keyframes.line
-    K = len(name)
-    span = jnp.stack([
-        lines.span[:, 0].at[name].min(lines.span[:, 0]),
-        lines.span[:, 1].at[name].max(lines.span[:, 1]),
-    ], axis=1)  # fmt: skip
-    lines = eqx.tree_at(
-        lambda l: (l.valid, l.span), lines, (lines.valid & (name == np.arange(K)), span)
-    )
+    line, (first, last) = problem.keyframes.line, lines.span.T
+    span = jnp.stack([first.at[name].min(first), last.at[name].max(last)], axis=1)
+    valid = lines.valid & (name == np.arange(len(name)))
+    lines = eqx.tree_at(lambda l: (l.valid, l.span), lines, (valid, span))
     line = jnp.asarray(name, line.dtype)[line]  # of the type that `_solve` was compiled for
     return eqx.tree_at(lambda p: p.keyframes.line, problem, line), lines
 
 
 @jax.jit
 def _straight(problem: Problem, lines: Lines):
-    """Without the lines that misfit what was seen of them much more than others do, and whether
-    there were any: no one straight line is what they show.
+    """Without lines that misfit what was seen of them much more than others do, which no one line
+    has shown; and whether there were any.
     """
     frames, K = problem.keyframes, lines.valid.shape[0]
     count = _sightings(frames, lines)
     square = (distances(problem.start, problem) ** 2).sum(axis=2)
     total = jnp.zeros(K).at[jnp.where(frames.known, frames.line, K)].add(square, mode="drop")
-    misfit = total / jnp.maximum(2 * count - 2, 1)
-    usual = jnp.nanmedian(jnp.where(lines.valid & (count > 2), misfit, jnp.nan))
-    bent = lines.valid & (misfit > BENT**2 * usual)
-    known = frames.known & ~bent[frames.line]
-    problem = eqx.tree_at(lambda p: p.keyframes.known, problem, known)
+    variance = total / jnp.maximum(2 * count - 2, 1).astype(total.dtype)
+    usual = jnp.nanmedian(jnp.where(lines.valid & (count > 2), variance, jnp.nan))
+    bent = lines.valid & (variance > BENT**2 * usual)
+    problem = eqx.tree_at(lambda p: p.keyframes.known, problem, frames.known & ~bent[frames.line])
     return problem, eqx.tree_at(lambda l: l.valid, lines, lines.valid & ~bent), bent.any()
 
 
