@@ -236,7 +236,7 @@ def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Probl
     begins = is_first | (np.diff(way, prepend=0) > float(rules.passing))
     parent, group, ends = old[begins], np.cumsum(begins) - 1, np.roll(begins, -1)
     enough = np.bincount(group, minlength=len(parent)) >= int(rules.min_sightings)
-    more = enough & ~is_first[begins]
+    more, own = enough & ~is_first[begins], enough | is_first[begins]
 
     count = int(lines.valid.sum())  # these come first
     new = np.where(more, count + np.cumsum(more) - 1, parent)
@@ -245,7 +245,7 @@ def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Probl
     source = np.zeros(size, int)
     source[:total] = np.append(np.arange(count), parent[more])
     span = np.tile([-np.inf, np.inf], (size, 1))
-    span[new[enough]] = np.stack([way[begins], way[ends]], axis=1)[enough]
+    span[new[own]] = np.stack([way[begins], way[ends]], axis=1)[own]
     span += rules.passing / 2 * np.array([-1, 1])
     name[at], known[at] = new[group], enough[group]
 
