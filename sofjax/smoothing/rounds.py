@@ -228,12 +228,13 @@ def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Probl
     """
     frames = problem.keyframes
     driven, known, name = map(np.array, (frames.driven, frames.known, frames.line))
+    passing = float(rules.passing)
     at = np.nonzero(known)
     order = np.lexsort((at[0], name[at]))
     at = at[0][order], at[1][order]
     old, way = name[at], driven[at[0]]
     is_first = np.diff(old, prepend=-1) != 0
-    begins = is_first | (np.diff(way, prepend=0) > float(rules.passing))
+    begins = is_first | (np.diff(way, prepend=0) > passing)
     parent, group, ends = old[begins], np.cumsum(begins) - 1, np.roll(begins, -1)
     enough = np.bincount(group, minlength=len(parent)) >= int(rules.min_sightings)
     more, own = enough & ~is_first[begins], enough | is_first[begins]
@@ -246,7 +247,7 @@ def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Probl
     source[:total] = np.append(np.arange(count), parent[more])
     span = np.tile([-np.inf, np.inf], (size, 1))
     span[new[own]] = np.stack([way[begins], way[ends]], axis=1)[own]
-    span += rules.passing / 2 * np.array([-1, 1])
+    span += passing / 2 * np.array([-1, 1])
     name[at], known[at] = new[group], enough[group]
 
     lines = jax.tree.map(lambda a: a[source], lines)
@@ -283,8 +284,7 @@ def _settled(config, rules, problem, lines, solution):
     outside = (kappa > m.kappa_above) | (kappa < m.kappa_below)
     # what is not known to be the floor's, as of a baseboard passed by, must not hold the poses
     raised = (outside & (jnp.abs(kappa - 1) > m.kappa_gate * sigma)) | (sigma > rules.kappa_known)
-    line = solution.unknowns.line
-    line = line.at[:, 2].set(jnp.where(raised, line[:, 2], 1))
+    line = jnp.where(raised[:, None], solution.unknowns.line, solution.on_floor)
     unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
     problem = eqx.tree_at(lambda p: p.start, problem, unknowns)
     # believe the pixels less where they disagree more than they should
