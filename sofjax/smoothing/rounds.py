@@ -33,7 +33,7 @@ from sofjax.smoothing.solution import TOLERANCE, Solution, solve
 
 ROUGH = 2e-3  # metres and radians to which poses settle in rounds that are not the last
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
-BENT = 2.0  # times the usual misfit, root mean square, that no one line has
+BENT = 2.0  # times the pixels' standard deviation: root mean square that no one line has
 
 
 class SmoothingRules(eqx.Module):
@@ -307,16 +307,15 @@ def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
 
 @jax.jit
 def _straight(problem: Problem, lines: Lines):
-    """Without lines that misfit what was seen of them much more than others do, which no one line
-    has shown; and whether there were any.
+    """Without lines that misfit what was seen of them by much more than pixels may, which no one
+    line has shown; and whether there were any.
     """
     frames, K = problem.keyframes, lines.valid.shape[0]
     count = _sightings(frames, lines)
     square = (distances(problem.start, problem) ** 2).sum(axis=2)
     total = jnp.zeros(K).at[jnp.where(frames.known, frames.line, K)].add(square, mode="drop")
     variance = total / jnp.maximum(2 * count - 2, 1).astype(total.dtype)
-    usual = jnp.nanmedian(jnp.where(lines.valid & (count > 2), variance, jnp.nan))
-    bent = lines.valid & (variance > BENT**2 * usual)
+    bent = lines.valid & (variance > (BENT * problem.priors.pixel_sigma) ** 2)
     problem = eqx.tree_at(lambda p: p.keyframes.known, problem, frames.known & ~bent[frames.line])
     return problem, eqx.tree_at(lambda l: l.valid, lines, lines.valid & ~bent), bent.any()
 
