@@ -21,9 +21,10 @@ class Lines(eqx.Module):
     anchor: SE2  # [K] T_world_foot in which each line is described
     line: Float[Array, "K 3"]  # (rho, theta, kappa) about the anchor
     reach: Float[Array, "K 2"]  # first and last place along the line, metres from the anchor
-    raised: Bool[Array, "K"]  # not on the floor: kappa is free
+    raised: Bool[Array, "K"]  # not on the floor, or not known to be: kappa is free
     valid: Bool[Array, "K"]
     span: Float[Array, "K 2"]  # metres of the way driven between which each may be seen
+    vague: Bool[Array, "K"]  # whether it is raised is not known
 
     @property
     def endpoints_world(self) -> Float[Array, "K 2 2"]:
@@ -41,7 +42,8 @@ def lines_of(
     local = jax.vmap(lambda T, e: T.inverse().apply(e))(anchor, endpoints_world)
     along = jnp.einsum("kij,kj->ki", local, direction(PolarLine(line[:, 0], line[:, 1])))
     always = jnp.broadcast_to(jnp.array([-jnp.inf, jnp.inf], line.dtype), along.shape)
-    return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid, always)
+    known = jnp.zeros_like(valid)
+    return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid, always, known)
 
 
 NEAREST = 256  # lines about a keyframe that its segments may show

@@ -81,6 +81,7 @@ def _near(lines: Lines, sightings: Int[Array, "K"]) -> Bool[Array, "K K"]:
             (jnp.abs(d[:, 0]) < REACH)
             & (jnp.abs(d[:, 1]) < TURN)
             & (gap < GAP)
+            & ((lines.raised == lines.raised[j]) | lines.vague | lines.vague[j])
             & lines.valid
             & lines.valid[j]
             & (sightings[j] >= LEAST)

@@ -128,7 +128,7 @@ def smooth(
             tolerance = ROUGH if left else TOLERANCE
             problem, lines, solution = _solved(config, rules, problem, lines, dissection, tolerance)
             costs.append((float(solution.cost_before), float(solution.cost)))
-            problem, lines, bent = _straight(problem, lines)
+            problem, lines, bent = _straight(config, problem, lines)
             into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
             if bent or joins.any():
                 merged += int(joins.sum())
@@ -138,6 +138,13 @@ def smooth(
                     config, rules, problem, lines, dissection, tolerance, sure=left == 0
                 )
                 costs.append((float(solution.cost_before), float(solution.cost)))
+        problem, lines, bent = _straight(config, problem, lines)
+        if bent:  # what was joined last and is no line
+            dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
+            problem, lines, solution = _solved(
+                config, rules, problem, lines, dissection, TOLERANCE, sure=True
+            )
+            costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
         return jax.device_get(
             Smoothed(
@@ -252,10 +259,11 @@ def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Probl
 
     lines = jax.tree.map(lambda a: a[source], lines)
     lines = eqx.tree_at(
-        lambda l: (l.raised, l.valid, l.span),
+        lambda l: (l.raised, l.vague, l.valid, l.span),
         lines,
         (
             lines.raised | (np.arange(size) >= count),
+            jnp.arange(size) >= count,
             jnp.arange(size) < total,
             jnp.asarray(span),
         ),
@@ -283,16 +291,22 @@ def _settled(config, rules, problem, lines, solution):
     kappa, sigma = solution.kappa_free, solution.kappa_sigma
     outside = (kappa > m.kappa_above) | (kappa < m.kappa_below)
     # what is not known to be the floor's, as of a baseboard passed by, must not hold the poses
-    raised = (outside & (jnp.abs(kappa - 1) > m.kappa_gate * sigma)) | (sigma > rules.kappa_known)
+    raised = outside & (jnp.abs(kappa - 1) > m.kappa_gate * sigma)
+    vague = ~raised & (sigma > rules.kappa_known)
+    raised = raised | vague
     line = jnp.where(raised[:, None], solution.unknowns.line, solution.on_floor)
     unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
     problem = eqx.tree_at(lambda p: p.start, problem, unknowns)
-    # believe the pixels less where they disagree more than they should
-    sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
-    problem = eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
+    problem = _believed(config, problem)
     reach, seen = reaches(problem, m.range)
     reach = jnp.where(seen[:, None], reach, lines.reach)
-    return problem, Lines(lines.anchor, line, reach, raised, lines.valid, lines.span)
+    return problem, Lines(lines.anchor, line, reach, raised, lines.valid, lines.span, vague)
+
+
+def _believed(config, problem: Problem) -> Problem:
+    """The pixels are believed less where they disagree more than they should."""
+    sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
+    return eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
 
 
 def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
@@ -306,7 +320,7 @@ def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
 
 
 @jax.jit
-def _straight(problem: Problem, lines: Lines):
+def _straight(config, problem: Problem, lines: Lines):
     """Without lines that misfit what was seen of them by much more than pixels may, which no one
     line has shown; and whether there were any.
     """
@@ -317,7 +331,8 @@ def _straight(problem: Problem, lines: Lines):
     variance = total / jnp.maximum(2 * count - 2, 1).astype(total.dtype)
     bent = lines.valid & (variance > (BENT * problem.priors.pixel_sigma) ** 2)
     problem = eqx.tree_at(lambda p: p.keyframes.known, problem, frames.known & ~bent[frames.line])
-    return problem, eqx.tree_at(lambda l: l.valid, lines, lines.valid & ~bent), bent.any()
+    lines = eqx.tree_at(lambda l: l.valid, lines, lines.valid & ~bent)
+    return _believed(config, problem), lines, bent.any()
 
 
 @jax.jit
