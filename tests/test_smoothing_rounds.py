@@ -8,10 +8,21 @@ import numpy as np
 import pytest
 
 from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floor_to_image
+from sofjax.motion import MotionModel
 from sofjax.observation import Observation
 from sofjax.segment_map import MapRules, empty_map
 from sofjax.slam import SlamConfig
-from sofjax.smoothing import Keyframes, Path, Seeing, SmoothingRules, Unknowns, rounds, smooth
+from sofjax.smoothing import (
+    Keyframes,
+    Path,
+    Priors,
+    Problem,
+    Seeing,
+    SmoothingRules,
+    Unknowns,
+    rounds,
+    smooth,
+)
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.dissection import dissect
 from sofjax.smoothing.elimination import Factors
@@ -73,8 +84,8 @@ def lines_along_x(y, reach, raised=None):
     ends = jnp.stack(
         [jnp.asarray(reach, float), jnp.broadcast_to(jnp.asarray(y)[:, None], (K, 2))], -1
     )
-    line = jnp.stack([jnp.asarray(y, float), jnp.zeros(K), jnp.ones(K)], axis=1)
     raised = jnp.zeros(K, bool) if raised is None else jnp.asarray(raised)
+    line = jnp.stack([jnp.asarray(y, float), jnp.zeros(K), 1 + 0.1 * raised.astype(float)], axis=1)
     anchor = SE2(jnp.zeros((K, 2)), jnp.zeros(K))
     return lines_of(anchor, line, ends, raised, jnp.ones(K, bool))
 
@@ -103,9 +114,73 @@ def test_a_segment_shows_the_nearest_line_that_reaches_it():
         lines,
         unknowns,
         Segments(image[None], jnp.ones((1, 3), bool)),
+        jnp.zeros(1),
     )
     assert known.tolist() == [[True, False, False]]
     assert index[0, 0] == 0
+
+
+@pytest.mark.parametrize(
+    ("y", "driven", "shows"),
+    [
+        (0.3, 5.0, True),
+        (0.0, 5.0, False),  # it points to the foot, as an edge of a door does
+        (0.3, 9.0, False),  # after the part of the way in which the line may be seen
+    ],
+)
+def test_what_may_be_upright_or_was_passed_shows_no_line(y, driven, shows):
+    lines = lines_along_x([y], [(1, 2)])
+    lines = replace(lines, span=jnp.array([[0.0, 6.0]]))
+    H_F = floor_homography(CAMERA, MOUNT, SE2.identity())
+    ends = jax.vmap(lambda p: floor_to_image(H_F, p)[0])(jnp.array([[1.2, y], [1.8, y]]))
+    seen = Segments(ends[None, None], jnp.ones((1, 1), bool))
+    unknowns = Unknowns(jnp.zeros((1, 5)), lines.line, jnp.zeros(8))
+    _, known = associate(Seeing(), 8.0, CAMERA, MOUNT, lines, unknowns, seen, jnp.array([driven]))
+    assert bool(known[0, 0]) == shows
+
+
+def drive_past(known, line, driven, lines):
+    """A problem of which only what was seen is there."""
+    n, M = known.shape
+    frames = Keyframes(
+        Segments(jnp.zeros((n, M, 2, 2)), jnp.asarray(known)), jnp.asarray(line),
+        jnp.asarray(known), SE2(jnp.zeros((n, 2)), jnp.zeros(n)),
+        jnp.pad(jnp.diff(jnp.asarray(driven, float), prepend=0.0)[:, None], ((0, 0), (0, 2))),
+    )  # fmt: skip
+    start = Unknowns(jnp.zeros((n, 5)), lines.line, jnp.zeros(8))
+    return Problem(
+        CAMERA, MOUNT, MotionModel(), Priors(), frames, lines.anchor, lines.raised, start
+    )
+
+
+def test_what_is_seen_again_after_a_way_is_another_line():
+    lines = lines_along_x([0.3, -0.3], [(1, 2), (1, 2)])
+    driven = np.array([0, 1, 2, 3, 20, 21, 22])
+    known = np.array([[1, 1], [1, 1], [1, 1], [1, 1], [1, 1], [1, 0], [1, 0]], bool)
+    line = np.tile([0, 1], (7, 1))
+    rules = SmoothingRules(room=4)
+    problem, apart = rounds._apart(rules, drive_past(known, line, driven, lines), lines)
+    assert problem.keyframes.line[:, 0].tolist() == [0, 0, 0, 0, 2, 2, 2]
+    assert not problem.keyframes.known[4, 1]  # once is too seldom for a line
+    assert apart.valid.tolist() == [True, True, True, False]
+    np.testing.assert_allclose(apart.span[:3], [[-5, 8], [-5, 8], [15, 27]], atol=1e-6)
+    np.testing.assert_allclose(apart.line[2], lines.line[0])
+    assert apart.raised.tolist()[:3] == [False, False, True]  # its height is anew to be found
+    same, _ = rounds._apart(
+        replace(rules, passing=np.inf), drive_past(known, line, driven, lines), lines
+    )
+    assert same.keyframes.line.tolist() == line.tolist()
+
+
+def test_what_may_as_well_be_one_as_another_is_left_for_later():
+    lines = lines_along_x([0.0, 0.1, 0.05], [(1, 2), (1, 2), (1, 2)])
+    sigma = jnp.diag(jnp.array([0.05, 0.01, 1e-6]))
+    joint = jnp.zeros((3, 3, 3, 3)).at[2, :, 2, :].set(sigma @ sigma)
+    _, joins = doubles(lines, known(joint), jnp.array([9, 8, 4]))
+    assert not joins.any()  # the first two are two, and the third may be either
+    lines = lines_along_x([0.0, 0.1, 0.05], [(1, 2), (5, 6), (1, 2)])
+    _, joins = doubles(lines, known(joint), jnp.array([9, 8, 4]))
+    assert joins.tolist() == [False, False, True]
 
 
 @pytest.mark.parametrize(
@@ -133,16 +208,18 @@ def test_lines_are_one_where_what_is_known_of_both_together_allows_it(
 
 
 def known(joint):
-    """Marginals of two lines that the only leaf eliminates, after the pose of its keyframe."""
+    """Marginals of some lines that the only leaf eliminates, after the pose of its keyframe."""
     none = jnp.zeros((1, 1), int)
     frames = Keyframes(
         Segments(jnp.zeros((1, 1, 2, 2)), none > 0), none, none > 0,
         SE2(jnp.zeros((1, 2)), jnp.zeros(1)), jnp.zeros((1, 3)),
     )  # fmt: skip
-    dissection = dissect(frames, 2, np.zeros(1, int))
+    K = len(joint)
+    dissection = dissect(frames, K, np.zeros(1, int))
     (only,) = dissection.generations
     a, q = only.own.shape[1], only.border.shape[1]
-    within = jnp.zeros((1, a + q, a + q)).at[0, 5:11, 5:11].set(joint.reshape(6, 6))
+    within = jnp.zeros((1, a + q, a + q))
+    within = within.at[0, 5 : 5 + 3 * K, 5 : 5 + 3 * K].set(joint.reshape(3 * K, 3 * K))
     factors = Factors(dissection, (jnp.zeros((1, a, a)),), (jnp.zeros((1, a, q)),))
     return Marginals(factors, (within,), jnp.zeros((1, 5, 5)))
 

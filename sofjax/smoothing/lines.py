@@ -21,8 +21,10 @@ class Lines(eqx.Module):
     anchor: SE2  # [K] T_world_foot in which each line is described
     line: Float[Array, "K 3"]  # (rho, theta, kappa) about the anchor
     reach: Float[Array, "K 2"]  # first and last place along the line, metres from the anchor
-    raised: Bool[Array, "K"]  # not on the floor: kappa is free
+    raised: Bool[Array, "K"]  # not on the floor, or not known to be: kappa is free
     valid: Bool[Array, "K"]
+    span: Float[Array, "K 2"]  # metres of the way driven between which each may be seen
+    vague: Bool[Array, "K"]  # whether it is raised is not known
 
     @property
     def endpoints_world(self) -> Float[Array, "K 2 2"]:
@@ -39,7 +41,9 @@ def lines_of(
     """Lines whose reach is that of segments along them."""
     local = jax.vmap(lambda T, e: T.inverse().apply(e))(anchor, endpoints_world)
     along = jnp.einsum("kij,kj->ki", local, direction(PolarLine(line[:, 0], line[:, 1])))
-    return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid)
+    always = jnp.broadcast_to(jnp.array([-jnp.inf, jnp.inf], line.dtype), along.shape)
+    known = jnp.zeros_like(valid)
+    return Lines(anchor, line, jnp.sort(along, axis=1), raised, valid, always, known)
 
 
 NEAREST = 256  # lines about a keyframe that its segments may show
@@ -51,16 +55,21 @@ class Seeing(eqx.Module):
     gate: float = 3.0  # pixels that an end may be off its line
     angle: float = 0.15  # radians between a segment and its line in the image
     join_gap: float = 0.1  # metres that a segment may lie beyond what was seen of its line
+    upright: float = 1.0  # pixels that an end may be off a line through the foot: may be upright
 
 
 def associate(
     seeing: Seeing, max_depth: Float[Array, ""] | float, camera: Camera, mount: Mount,
-    lines: Lines, unknowns: Unknowns, segments_image: Segments,
+    lines: Lines, unknowns: Unknowns, segments_image: Segments, driven: Float[Array, "n"],
 ) -> tuple[Int[Array, "n M"], Bool[Array, "n M"]]:  # fmt: skip
     """For each segment of each keyframe the line that lies nearest to both of its ends, in pixels.
 
     **Arguments:**
     - `max_depth`: metres; what is farther is not used.
+    - `driven`: metres, at each keyframe.
+
+    An upright edge, of a door or a box, always points to the foot, and from a short way looks like
+    a line of the floor: what points there shows no line.
 
     **Returns:** the line's index, and whether there is one within the gates.
     """
@@ -68,14 +77,15 @@ def associate(
     K, ends_world = lines.valid.shape[0], lines.endpoints_world
 
     def of_keyframe(each):
-        pose, endpoints, valid = each
+        pose, endpoints, valid, driven = each
         T_world_foot = SE2(pose[:2], pose[2]) @ mount.T_robot_foot
         H_F = floor_homography(camera, foot_mount(mount, pose), SE2.identity())
         seen, _ = jax.vmap(appear, in_axes=(0, 0, None))(lines.line, lines.anchor, T_world_foot)
         apparent = T_world_foot.inverse().apply(ends_world) * seen[:, 2, None, None]
-        far = jnp.where(lines.valid, jax.vmap(_from_origin)(apparent), jnp.inf)
+        there = lines.valid & (lines.span[:, 0] <= driven) & (driven <= lines.span[:, 1])
+        far = jnp.where(there, jax.vmap(_from_origin)(apparent), jnp.inf)
         near = jax.lax.top_k(-far, min(K, NEAREST))[1]
-        seen, apparent, there = seen[near], apparent[near], lines.valid[near]
+        seen, apparent, there = seen[near], apparent[near], there[near]
         n = normal(PolarLine(seen[:, 0], seen[:, 1]))
         l = jnp.concatenate([n, -seen[:, :1]], axis=1) @ cofactor(H_F).T
         distance = jax.vmap(jax.vmap(line_point_distance, in_axes=(0, None)), in_axes=(None, 0))
@@ -91,14 +101,26 @@ def associate(
             & (jnp.abs(first - second) < seeing.angle * length)
             & (shared(apparent, on_floor) > -seeing.join_gap)
             & there
-            & (valid & some)[:, None]
-        )
+            & (valid & some & ~jax.vmap(_points_to, in_axes=(0, None, None))(
+                endpoints, H_F[:, 2], seeing.upright
+            ))[:, None]
+        )  # fmt: skip
         off = jnp.where(possible, first**2 + second**2, jnp.inf)
         return near[off.argmin(axis=1)], possible.any(axis=1)
 
-    return jax.lax.map(
-        of_keyframe, (unknowns.pose, segments_image.endpoints, segments_image.valid), batch_size=8
-    )
+    each = (unknowns.pose, segments_image.endpoints, segments_image.valid, driven)
+    return jax.lax.map(of_keyframe, each, batch_size=8)
+
+
+def _points_to(
+    segment: Float[Array, "2 2"], place: Float[Array, "3"], gate: Float[Array, ""] | float
+) -> Bool[Array, ""]:
+    """Whether the ends are within `gate` of the line through a place (homogeneous) and the middle.
+
+    Both in pixels.
+    """
+    line = jnp.cross(place, jnp.append(segment.mean(axis=0), 1))
+    return jnp.abs(line_point_distance(line, segment[0])) < gate
 
 
 def _from_origin(ends: Float[Array, "2 2"]) -> Float[Array, ""]:

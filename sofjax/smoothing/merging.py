@@ -33,15 +33,20 @@ def doubles(
     """
     K = lines.valid.shape[0]
     i, j = np.nonzero(np.asarray(_near(lines, sightings)))
-    into, least = np.zeros(K, int), np.full(K, np.inf)
+    into, least, doubtful = np.zeros(K, int), np.full(K, np.inf), np.zeros(K, bool)
     if len(i):
         room = np.zeros(-len(i) % PAIRS, int)
         pairs = np.stack([np.append(i, room), np.append(j, room)], axis=1).reshape(-1, PAIRS, 2)
         error = np.concatenate([_errors(lines, marginals, *some.T) for some in pairs])
-        for a, b, e in zip(i, j, error, strict=False):
+        error = dict(zip(zip(i.tolist(), j.tolist(), strict=True), error.tolist(), strict=False))
+        for (a, b), e in error.items():
             if e < min(GATE**2, least[b]):
                 into[b], least[b] = a, e
-    return into, np.isfinite(least)
+        one = lambda a, b: min(error.get((a, b), np.inf), error.get((b, a), np.inf)) < GATE**2
+        for (a, b), e in error.items():  # what may as well be another is left for later
+            if e < least[b] + GATE**2 and a != into[b] and not one(a, into[b]):
+                doubtful[b] = True
+    return into, np.isfinite(least) & ~doubtful
 
 
 def _at(lines, k, here):
@@ -76,7 +81,7 @@ def _near(lines: Lines, sightings: Int[Array, "K"]) -> Bool[Array, "K K"]:
             (jnp.abs(d[:, 0]) < REACH)
             & (jnp.abs(d[:, 1]) < TURN)
             & (gap < GAP)
-            & (lines.raised == lines.raised[j])
+            & ((lines.raised == lines.raised[j]) | lines.vague | lines.vague[j])
             & lines.valid
             & lines.valid[j]
             & (sightings[j] >= LEAST)

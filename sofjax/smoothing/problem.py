@@ -26,6 +26,11 @@ class Keyframes(eqx.Module):
     motion: SE2  # [n] odometer since the keyframe before; the first is not used
     way: Float[Array, "n 3"]  # metres driven, radians turned left and (negative) right, as read
 
+    @property
+    def driven(self) -> Float[Array, "n"]:
+        """Metres since the first."""
+        return jnp.cumsum(self.way[:, 0])
+
 
 class Unknowns(eqx.Module):
     """What is solved for."""

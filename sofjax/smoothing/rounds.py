@@ -20,11 +20,20 @@ from sofjax.smoothing.dissection import Dissection, dissect, divide
 from sofjax.smoothing.extents import reaches
 from sofjax.smoothing.lines import Lines, Seeing, associate, lines_of
 from sofjax.smoothing.merging import doubles, representatives
-from sofjax.smoothing.problem import Keyframes, Priors, Problem, Unknowns, corrected, misfit
+from sofjax.smoothing.problem import (
+    Keyframes,
+    Priors,
+    Problem,
+    Unknowns,
+    corrected,
+    distances,
+    misfit,
+)
 from sofjax.smoothing.solution import TOLERANCE, Solution, solve
 
 ROUGH = 2e-3  # metres and radians to which poses settle in rounds that are not the last
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
+BENT = 2.0  # times the pixels' standard deviation: root mean square that no one line has
 
 
 class SmoothingRules(eqx.Module):
@@ -38,6 +47,7 @@ class SmoothingRules(eqx.Module):
     min_sightings: int = 3  # keyframes that a line takes
     room: int = eqx.field(static=True, default=kf.PAD)  # least sizes of what is compiled
     kappa_known: float = 0.03  # standard deviation below which a line may be one of the final map
+    passing: float = 10.0  # metres driven after which what is seen again is told anew
     seeing: Seeing = Seeing()
 
 
@@ -109,21 +119,32 @@ def smooth(
         )
         costs, merged, dissection = [], 0, None
         leaf = divide(np.asarray(start.pose[:, :2]))
+        problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
+        problem, lines = _apart(rules, problem, lines)
         for left in reversed(range(rules.rounds)):
-            problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
+            if left < rules.rounds - 1:
+                problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
             dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
             tolerance = ROUGH if left else TOLERANCE
-            problem, lines, solution = _solved(config, problem, lines, dissection, tolerance)
+            problem, lines, solution = _solved(config, rules, problem, lines, dissection, tolerance)
             costs.append((float(solution.cost_before), float(solution.cost)))
+            problem, lines, bent = _straight(config, problem, lines)
             into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
-            if joins.any():
+            if bent or joins.any():
                 merged += int(joins.sum())
                 problem, lines = _renamed(problem, lines, representatives(into, joins))
                 dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
                 problem, lines, solution = _solved(
-                    config, problem, lines, dissection, tolerance, sure=left == 0
+                    config, rules, problem, lines, dissection, tolerance, sure=left == 0
                 )
                 costs.append((float(solution.cost_before), float(solution.cost)))
+        problem, lines, bent = _straight(config, problem, lines)
+        if bent:  # what was joined last and is no line
+            dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
+            problem, lines, solution = _solved(
+                config, rules, problem, lines, dissection, TOLERANCE, sure=True
+            )
+            costs.append((float(solution.cost_before), float(solution.cost)))
         pose = problem.start.pose
         return jax.device_get(
             Smoothed(
@@ -190,7 +211,7 @@ def _associated(
     """With the lines that the segments of `frames` show by the present estimate, and only those."""
     line, known = _shown(
         seeing, max_depth, problem.camera, problem.mount, lines, problem.start,
-        frames.segments_image,
+        frames.segments_image, frames.driven,
     )  # fmt: skip
     frames = eqx.tree_at(lambda f: (f.line, f.known), frames, (line, known))
     most = int(known.sum(axis=1).max())
@@ -206,39 +227,112 @@ _narrowed = jax.jit(kf.narrowed, static_argnums=1)
 _shown = jax.jit(associate)
 
 
+def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Problem, Lines]:
+    """What is seen again after `rules.passing` metres is another line until it is found to be one.
+
+    Where a drive has drifted by as much as two edges are apart, as the foot and the top of a
+    baseboard, each is taken for the other and so are all beside them: no solution leads back.
+    """
+    frames = problem.keyframes
+    driven, known, name = map(np.array, (frames.driven, frames.known, frames.line))
+    passing = float(rules.passing)
+    at = np.nonzero(known)
+    order = np.lexsort((at[0], name[at]))
+    at = at[0][order], at[1][order]
+    old, way = name[at], driven[at[0]]
+    is_first = np.diff(old, prepend=-1) != 0
+    begins = is_first | (np.diff(way, prepend=0) > passing)
+    parent, group, ends = old[begins], np.cumsum(begins) - 1, np.roll(begins, -1)
+    enough = np.bincount(group, minlength=len(parent)) >= int(rules.min_sightings)
+    more, own = enough & ~is_first[begins], enough | is_first[begins]
+
+    count = int(lines.valid.sum())  # these come first
+    new = np.where(more, count + np.cumsum(more) - 1, parent)
+    total = count + int(more.sum())
+    size = kf.padded(max(total, 1), rules.room)
+    source = np.zeros(size, int)
+    source[:total] = np.append(np.arange(count), parent[more])
+    span = np.tile([-np.inf, np.inf], (size, 1))
+    span[new[own]] = np.stack([way[begins], way[ends]], axis=1)[own]
+    span += passing / 2 * np.array([-1, 1])
+    name[at], known[at] = new[group], enough[group]
+
+    lines = jax.tree.map(lambda a: a[source], lines)
+    lines = eqx.tree_at(
+        lambda l: (l.raised, l.vague, l.valid, l.span),
+        lines,
+        (
+            lines.raised | (np.arange(size) >= count),
+            jnp.arange(size) >= count,
+            jnp.arange(size) < total,
+            jnp.asarray(span),
+        ),
+    )
+    problem = eqx.tree_at(
+        lambda p: (p.start.line, p.keyframes.line, p.keyframes.known),
+        problem,
+        (lines.line, jnp.asarray(name), jnp.asarray(known)),
+    )
+    return problem, lines
+
+
 def _solved(
-    config, problem: Problem, lines: Lines, dissection: Dissection, tolerance: float, sure=True
+    config, rules, problem: Problem, lines: Lines, dissection: Dissection, tolerance, sure=True
 ):
     """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
     problem = eqx.tree_at(lambda p: (p.anchor, p.raised), problem, (lines.anchor, lines.raised))
     solution = solve(problem, dissection, sure=sure, tolerance=tolerance)
-    return *_settled(config, problem, lines, solution), solution
+    return *_settled(config, rules, problem, lines, solution), solution
 
 
 @jax.jit
-def _settled(config, problem, lines, solution):
-    rules = config.segment_map
+def _settled(config, rules, problem, lines, solution):
+    m = config.segment_map
     kappa, sigma = solution.kappa_free, solution.kappa_sigma
-    outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
-    raised = outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
-    line = solution.unknowns.line
-    line = line.at[:, 2].set(jnp.where(raised, line[:, 2], 1))
+    outside = (kappa > m.kappa_above) | (kappa < m.kappa_below)
+    # what is not known to be the floor's, as of a baseboard passed by, must not hold the poses
+    raised = outside & (jnp.abs(kappa - 1) > m.kappa_gate * sigma)
+    vague = ~raised & (sigma > rules.kappa_known)
+    raised = raised | vague
+    line = jnp.where(raised[:, None], solution.unknowns.line, solution.on_floor)
     unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
     problem = eqx.tree_at(lambda p: p.start, problem, unknowns)
-    # believe the pixels less where they disagree more than they should
-    sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
-    problem = eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
-    reach, seen = reaches(problem, rules.range)
+    problem = _believed(config, problem)
+    reach, seen = reaches(problem, m.range)
     reach = jnp.where(seen[:, None], reach, lines.reach)
-    return problem, Lines(lines.anchor, line, reach, raised, lines.valid)
+    return problem, Lines(lines.anchor, line, reach, raised, lines.valid, lines.span, vague)
+
+
+def _believed(config, problem: Problem) -> Problem:
+    """The pixels are believed less where they disagree more than they should."""
+    sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
+    return eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
 
 
 def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
     """Lines that are one go on as one: their segments show it, and its reach is that of all."""
-    line = problem.keyframes.line
-    lines = eqx.tree_at(lambda l: l.valid, lines, lines.valid & (name == np.arange(len(name))))
+    line, (first, last) = problem.keyframes.line, lines.span.T
+    span = jnp.stack([first.at[name].min(first), last.at[name].max(last)], axis=1)
+    valid = lines.valid & (name == np.arange(len(name)))
+    lines = eqx.tree_at(lambda l: (l.valid, l.span), lines, (valid, span))
     line = jnp.asarray(name, line.dtype)[line]  # of the type that `_solve` was compiled for
     return eqx.tree_at(lambda p: p.keyframes.line, problem, line), lines
+
+
+@jax.jit
+def _straight(config, problem: Problem, lines: Lines):
+    """Without lines that misfit what was seen of them by much more than pixels may, which no one
+    line has shown; and whether there were any.
+    """
+    frames, K = problem.keyframes, lines.valid.shape[0]
+    count = _sightings(frames, lines)
+    square = (distances(problem.start, problem) ** 2).sum(axis=2)
+    total = jnp.zeros(K).at[jnp.where(frames.known, frames.line, K)].add(square, mode="drop")
+    variance = total / jnp.maximum(2 * count - 2, 1).astype(total.dtype)
+    bent = lines.valid & (variance > (BENT * problem.priors.pixel_sigma) ** 2)
+    problem = eqx.tree_at(lambda p: p.keyframes.known, problem, frames.known & ~bent[frames.line])
+    lines = eqx.tree_at(lambda l: l.valid, lines, lines.valid & ~bent)
+    return _believed(config, problem), lines, bent.any()
 
 
 @jax.jit

@@ -38,6 +38,7 @@ class Solution(eqx.Module):
     marginals: Marginals
     kappa_free: Float[Array, "K"]  # each line's kappa if it alone were free, poses held ...
     kappa_sigma: Float[Array, "K"]  # ... and its standard deviation
+    on_floor: Float[Array, "K 3"]  # each line if it alone were free, but on the floor
 
     @property
     def pose_covariance(self) -> Float[Array | np.ndarray, "n 5 5"]:
@@ -94,11 +95,12 @@ def _solve(
     J, frames = Jacobian.of(jvp, unknowns), problem.keyframes
     blocks = J.blocks(frames, 0.0)
 
-    # each line alone, kappa free, about the poses found
+    # each line alone about the poses found, kappa free and then 1
     _, gradient = J.transposed(frames, r)
     weak = jnp.diag(jnp.array([1e-2, 1e-2, 1 / problem.priors.kappa_sigma**2]))
     alone = jnp.linalg.inv(blocks.sighted + weak)
-    free = unknowns.line[:, 2] - jnp.einsum("ki,ki->k", alone[:, 2], gradient)
+    free = unknowns.line - jnp.einsum("kij,kj->ki", alone, gradient)
+    gain = alone[:, :, 2] / alone[:, 2:, 2]
     return Solution(
         unknowns=unknowns,
         cost_before=_cost(residuals(problem.start, problem)),
@@ -106,8 +108,9 @@ def _solve(
         steps=found.stats["num_steps"],
         converged=found.result == optx.RESULTS.successful,
         marginals=_if(sure, lambda: marginals(eliminate(blocks, dissection))),
-        kappa_free=free,
+        kappa_free=free[:, 2],
         kappa_sigma=jnp.sqrt(alone[:, 2, 2]),
+        on_floor=(free + gain * (1 - free[:, 2:])).at[:, 2].set(1),
     )
 
 
