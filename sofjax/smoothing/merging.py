@@ -49,9 +49,9 @@ def doubles(
     return into, np.isfinite(least) & ~doubtful
 
 
-def _at(lines, k, here):
+def _at(lines, k, line, here):
     """A line, and how it depends on (rho, theta, kappa), about a foot."""
-    line, H = appear(lines.line[k], jax.tree.map(lambda a: a[k], lines.anchor), here)
+    line, H = appear(line, jax.tree.map(lambda a: a[k], lines.anchor), here)
     return line, jnp.concatenate([H, jnp.array([[0.0, 0.0, 1.0]], H.dtype)])
 
 
@@ -73,7 +73,7 @@ def _near(lines: Lines, sightings: Int[Array, "K"]) -> Bool[Array, "K K"]:
 
     def of_line(j):
         here = _middle(ends[j])
-        line = jax.vmap(lambda k: _at(lines, k, here)[0])(jnp.arange(K))
+        line = jax.vmap(lambda k: _at(lines, k, lines.line[k], here)[0])(jnp.arange(K))
         d, _ = jax.vmap(_difference, in_axes=(0, None))(line, line[j])
         gap = -jax.vmap(overlap, in_axes=(None, 0))(ends[j], ends)
         more = (sightings > sightings[j]) | ((sightings == sightings[j]) & (jnp.arange(K) < j))
@@ -95,18 +95,31 @@ def _near(lines: Lines, sightings: Int[Array, "K"]) -> Bool[Array, "K K"]:
 def _errors(
     lines: Lines, marginals: Marginals, i: Int[Array, "pairs"], j: Int[Array, "pairs"]
 ) -> Float[Array, "pairs"]:
-    """Squared difference of the two, in units of its covariance."""
+    """Squared difference of the two, in units of its covariance.
+
+    Where neither is known to stand above the floor, the larger of that and the one if both lay on
+    it: a height that is free explains too well why two edges of the floor should be one.
+    """
     ends = lines.endpoints_world
     model = jnp.diag(jnp.array(MODEL, lines.line.dtype) ** 2)
+    above = lines.raised & ~lines.vague
+
+    def difference(i, j, pair, covariance):
+        here = _middle(ends[j])
+        (a, A), (b, B) = _at(lines, i, pair[:3], here), _at(lines, j, pair[3:], here)
+        d, side = _difference(a, b)
+        D = jnp.concatenate([A, -side[:, None] * B], axis=1)
+        return d @ jnp.linalg.solve(D @ covariance @ D.T + model, d)
 
     def of_pair(i, j, own_i, own_j, both):
-        here = _middle(ends[j])
-        (a, A), (b, B) = _at(lines, i, here), _at(lines, j, here)
-        d, side = _difference(a, b)
-        B = side[:, None] * B
-        cross = A @ both @ B.T
-        S = A @ own_i @ A.T + B @ own_j @ B.T - cross - cross.T + model
-        return d @ jnp.linalg.solve(S, d)
+        pair = jnp.concatenate([lines.line[i], lines.line[j]])
+        covariance = jnp.block([[own_i, both], [both.T, own_j]])
+        kappa = covariance[:, 2::3]
+        gain = kappa @ jnp.linalg.inv(kappa[2::3] + MODEL[2] ** 2 * jnp.eye(2))
+        on_floor = pair + gain @ (1 - pair[2::3])
+        error = difference(i, j, pair, covariance)
+        error_on_floor = difference(i, j, on_floor, covariance - gain @ kappa.T)
+        return jnp.maximum(error, jnp.where(above[i] | above[j], 0, error_on_floor))
 
     of = marginals.of_lines
     return jax.vmap(of_pair)(i, j, of(i, i), of(j, j), of(i, j))
