@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -205,6 +206,19 @@ def test_lines_are_one_where_what_is_known_of_both_together_allows_it(
     into, joins = doubles(lines, known(joint), jnp.array([9, 4]))
     assert joins.tolist() == [False, is_one]
     assert not is_one or into[1] == 0
+
+
+@pytest.mark.parametrize(("vague", "is_one"), [(True, False), (False, True)])
+def test_two_edges_of_the_floor_are_not_made_one_by_heights_that_are_free(vague, is_one):
+    """Each passed on another side, which shifts what stands above the floor the other way."""
+    lines = lines_along_x([0.0, 0.1], [(1, 2), (1, 2)], [True, True])
+    lines = eqx.tree_at(
+        lambda l: (l.line, l.vague), lines, (lines.line.at[:, 2].set(1), jnp.array([vague] * 2))
+    )
+    passed = jnp.array([[0.8, 0, 1], [-0.8, 0, 1]]) * 0.1  # metres, radians, kappa
+    joint = jnp.einsum("ka,kb,kl->kalb", passed, passed, jnp.eye(2))
+    _, joins = doubles(lines, known(joint), jnp.array([9, 4]))
+    assert joins.tolist() == [False, is_one]
 
 
 def known(joint):
