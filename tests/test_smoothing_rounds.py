@@ -31,6 +31,7 @@ from sofjax.smoothing.lines import associate, lines_of
 from sofjax.smoothing.marginals import Marginals
 from sofjax.smoothing.merging import doubles, representatives
 from sofjax.smoothing.solution import solve
+from sofjax.smoothing.ties import apart
 
 
 def straight(n, step=0.1):
@@ -159,17 +160,15 @@ def test_what_is_seen_again_after_a_way_is_another_line():
     driven = np.array([0, 1, 2, 3, 20, 21, 22])
     known = np.array([[1, 1], [1, 1], [1, 1], [1, 1], [1, 1], [1, 0], [1, 0]], bool)
     line = np.tile([0, 1], (7, 1))
-    rules = SmoothingRules(room=4)
-    problem, apart = rounds._apart(rules, drive_past(known, line, driven, lines), lines)
-    assert problem.keyframes.line[:, 0].tolist() == [0, 0, 0, 0, 2, 2, 2]
-    assert not problem.keyframes.known[4, 1]  # once is too seldom for a line
-    assert apart.valid.tolist() == [True, True, True, False]
-    np.testing.assert_allclose(apart.span[:3], [[-5, 8], [-5, 8], [15, 27]], atol=1e-6)
-    np.testing.assert_allclose(apart.line[2], lines.line[0])
-    assert apart.raised.tolist()[:3] == [False, False, True]  # its height is anew to be found
-    same, _ = rounds._apart(
-        replace(rules, passing=np.inf), drive_past(known, line, driven, lines), lines
-    )
+    problem = drive_past(known, line, driven, lines)
+    told, passes = apart(problem, lines, passing=10.0, least=3, room=4)
+    assert told.keyframes.line[:, 0].tolist() == [0, 0, 0, 0, 2, 2, 2]
+    assert not told.keyframes.known[4, 1]  # once is too seldom for a line
+    assert passes.valid.tolist() == [True, True, True, False]
+    np.testing.assert_allclose(passes.span[:3], [[-5, 8], [-5, 8], [15, 27]], atol=1e-6)
+    np.testing.assert_allclose(passes.line[2], lines.line[0])
+    assert passes.raised.tolist()[:3] == [False, False, True]  # its height is anew to be found
+    same, _ = apart(problem, lines, passing=np.inf, least=3, room=4)
     assert same.keyframes.line.tolist() == line.tolist()
 
 

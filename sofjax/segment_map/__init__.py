@@ -16,3 +16,4 @@ from sofjax.segment_map.lines import empty_map as empty_map
 from sofjax.segment_map.lines import in_view as in_view
 from sofjax.segment_map.lines import is_raised as is_raised
 from sofjax.segment_map.lines import nearby as nearby
+from sofjax.segment_map.lines import on_floor as on_floor

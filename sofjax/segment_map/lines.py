@@ -90,15 +90,23 @@ def is_raised(
     return rules.classify & outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
 
 
+def on_floor(line: Float[Array, "3"], covariance: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """What a line is most likely to be if it lies on the floor: conditioned on kappa = 1."""
+    gain = covariance[:, 2] / covariance[2, 2]
+    return (line + gain * (1 - line[2])).at[2].set(1)
+
+
 def believed(
     rules: MapRules, line: Float[Array, "3"], covariance: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """A line's estimate given its class: of a floor line, conditioned on kappa = 1."""
     gain = covariance[:, 2] / covariance[2, 2]
-    on_floor = (line + gain * (1 - line[2])).at[2].set(1)
     certain = covariance - jnp.outer(gain, covariance[2])
     raised = is_raised(rules, line, covariance)
-    return jnp.where(raised, line, on_floor), jnp.where(raised, covariance, certain)
+    return (
+        jnp.where(raised, line, on_floor(line, covariance)),
+        jnp.where(raised, covariance, certain),
+    )
 
 
 def appear(

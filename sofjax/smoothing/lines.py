@@ -64,12 +64,12 @@ def associate(
 ) -> tuple[Int[Array, "n M"], Bool[Array, "n M"]]:  # fmt: skip
     """For each segment of each keyframe the line that lies nearest to both of its ends, in pixels.
 
+    An upright edge, of a door or a box, always points to the foot, and from a short way looks like
+    a line of the floor: what points there shows no line.
+
     **Arguments:**
     - `max_depth`: metres; what is farther is not used.
     - `driven`: metres, at each keyframe.
-
-    An upright edge, of a door or a box, always points to the foot, and from a short way looks like
-    a line of the floor: what points there shows no line.
 
     **Returns:** the line's index, and whether there is one within the gates.
     """
@@ -96,15 +96,16 @@ def associate(
             H_F, endpoints, jnp.asarray(max_depth, pose.dtype)
         )
         shared = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))
+        upright = jax.vmap(_points_to, in_axes=(0, None, None))(
+            endpoints, H_F[:, 2], seeing.upright
+        )
         possible = (
             (jnp.maximum(jnp.abs(first), jnp.abs(second)) < seeing.gate)
             & (jnp.abs(first - second) < seeing.angle * length)
             & (shared(apparent, on_floor) > -seeing.join_gap)
             & there
-            & (valid & some & ~jax.vmap(_points_to, in_axes=(0, None, None))(
-                endpoints, H_F[:, 2], seeing.upright
-            ))[:, None]
-        )  # fmt: skip
+            & (valid & some & ~upright)[:, None]
+        )
         off = jnp.where(possible, first**2 + second**2, jnp.inf)
         return near[off.argmin(axis=1)], possible.any(axis=1)
 

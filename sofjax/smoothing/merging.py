@@ -27,7 +27,8 @@ def doubles(
 
     The two are compared where the line itself is, with the covariance of their difference: two
     edges that were seen side by side are known well against each other and stay two; what was
-    seen again after a long way is known badly against what was seen first.
+    seen again after a long way is known badly against what was seen first. What may as well be
+    one line as another that is not the same is left for later, when more is known.
 
     **Returns:** [K] the other's index, and whether there is one.
     """
@@ -42,16 +43,16 @@ def doubles(
         for (a, b), e in error.items():
             if e < min(GATE**2, least[b]):
                 into[b], least[b] = a, e
-        one = lambda a, b: min(error.get((a, b), np.inf), error.get((b, a), np.inf)) < GATE**2
-        for (a, b), e in error.items():  # what may as well be another is left for later
-            if e < least[b] + GATE**2 and a != into[b] and not one(a, into[b]):
+        same = lambda a, b: min(error.get((a, b), np.inf), error.get((b, a), np.inf)) < GATE**2
+        for (a, b), e in error.items():
+            if e < least[b] + GATE**2 and a != into[b] and not same(a, into[b]):
                 doubtful[b] = True
     return into, np.isfinite(least) & ~doubtful
 
 
-def _at(lines, k, line, here):
+def _at(line, anchor, here):
     """A line, and how it depends on (rho, theta, kappa), about a foot."""
-    line, H = appear(line, jax.tree.map(lambda a: a[k], lines.anchor), here)
+    line, H = appear(line, anchor, here)
     return line, jnp.concatenate([H, jnp.array([[0.0, 0.0, 1.0]], H.dtype)])
 
 
@@ -73,7 +74,7 @@ def _near(lines: Lines, sightings: Int[Array, "K"]) -> Bool[Array, "K K"]:
 
     def of_line(j):
         here = _middle(ends[j])
-        line = jax.vmap(lambda k: _at(lines, k, lines.line[k], here)[0])(jnp.arange(K))
+        line, _ = jax.vmap(appear, in_axes=(0, 0, None))(lines.line, lines.anchor, here)
         d, _ = jax.vmap(_difference, in_axes=(0, None))(line, line[j])
         gap = -jax.vmap(overlap, in_axes=(None, 0))(ends[j], ends)
         more = (sightings > sightings[j]) | ((sightings == sightings[j]) & (jnp.arange(K) < j))
@@ -106,7 +107,8 @@ def _errors(
 
     def difference(i, j, pair, covariance):
         here = _middle(ends[j])
-        (a, A), (b, B) = _at(lines, i, pair[:3], here), _at(lines, j, pair[3:], here)
+        anchor = lambda k: jax.tree.map(lambda a: a[k], lines.anchor)
+        (a, A), (b, B) = _at(pair[:3], anchor(i), here), _at(pair[3:], anchor(j), here)
         d, side = _difference(a, b)
         D = jnp.concatenate([A, -side[:, None] * B], axis=1)
         return d @ jnp.linalg.solve(D @ covariance @ D.T + model, d)

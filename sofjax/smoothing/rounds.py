@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.observation import Observation
-from sofjax.segment_map import MapRules, SegmentMap, is_raised
+from sofjax.segment_map import MapRules, SegmentMap, is_raised, on_floor
 from sofjax.slam import FinalMap, SlamConfig
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.dissection import Dissection, dissect, divide
@@ -26,14 +26,13 @@ from sofjax.smoothing.problem import (
     Problem,
     Unknowns,
     corrected,
-    distances,
     misfit,
 )
 from sofjax.smoothing.solution import TOLERANCE, Solution, solve
+from sofjax.smoothing.ties import apart, renamed, sightings, without_bent
 
 ROUGH = 2e-3  # metres and radians to which poses settle in rounds that are not the last
 NARROW = 32  # segments of a keyframe that are solved for, if more do not show a line
-BENT = 2.0  # times the pixels' standard deviation: root mean square that no one line has
 
 
 class SmoothingRules(eqx.Module):
@@ -119,32 +118,34 @@ def smooth(
         )
         costs, merged, dissection = [], 0, None
         leaf = divide(np.asarray(start.pose[:, :2]))
+
+        def solved(problem, lines, tolerance, sure=True):
+            nonlocal dissection
+            dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
+            problem, lines, solution = _solved(
+                config, rules, problem, lines, dissection, tolerance, sure
+            )
+            costs.append((float(solution.cost_before), float(solution.cost)))
+            return problem, lines, solution
+
         problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
-        problem, lines = _apart(rules, problem, lines)
+        problem, lines = apart(
+            problem, lines, float(rules.passing), int(rules.min_sightings), rules.room
+        )
         for left in reversed(range(rules.rounds)):
             if left < rules.rounds - 1:
                 problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
-            dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
             tolerance = ROUGH if left else TOLERANCE
-            problem, lines, solution = _solved(config, rules, problem, lines, dissection, tolerance)
-            costs.append((float(solution.cost_before), float(solution.cost)))
+            problem, lines, solution = solved(problem, lines, tolerance)
             problem, lines, bent = _straight(config, problem, lines)
-            into, joins = doubles(lines, solution.marginals, _sightings(problem.keyframes, lines))
+            into, joins = doubles(lines, solution.marginals, sightings(problem.keyframes, lines))
             if bent or joins.any():
                 merged += int(joins.sum())
-                problem, lines = _renamed(problem, lines, representatives(into, joins))
-                dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
-                problem, lines, solution = _solved(
-                    config, rules, problem, lines, dissection, tolerance, sure=left == 0
-                )
-                costs.append((float(solution.cost_before), float(solution.cost)))
+                problem, lines = renamed(problem, lines, representatives(into, joins))
+                problem, lines, solution = solved(problem, lines, tolerance, sure=left == 0)
         problem, lines, bent = _straight(config, problem, lines)
         if bent:  # what was joined last and is no line
-            dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
-            problem, lines, solution = _solved(
-                config, rules, problem, lines, dissection, TOLERANCE, sure=True
-            )
-            costs.append((float(solution.cost_before), float(solution.cost)))
+            problem, lines, solution = solved(problem, lines, TOLERANCE)
         pose = problem.start.pose
         return jax.device_get(
             Smoothed(
@@ -153,7 +154,7 @@ def smooth(
                 mount=corrected(mount, problem.start.shared),
                 lines=lines,
                 endpoints_world=jax.jit(lambda lines: lines.endpoints_world)(lines),
-                sightings=_sightings(problem.keyframes, lines),
+                sightings=sightings(problem.keyframes, lines),
                 problem=problem,
                 solution=solution,
                 costs=costs,
@@ -192,9 +193,7 @@ def _lines_of_map(rules: MapRules, m: SegmentMap, smoothing: SmoothingRules) -> 
 def _chosen(rules, m, slots, count):
     m = jax.tree.map(lambda a: a[slots], m)
     raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
-    gain = m.covariance[:, :, 2] / m.covariance[:, 2:, 2]
-    on_floor = (m.line + gain * (1 - m.line[:, 2:])).at[:, 2].set(1)
-    line = jnp.where(raised[:, None], m.line, on_floor)
+    line = jnp.where(raised[:, None], m.line, jax.vmap(on_floor)(m.line, m.covariance))
     real = jnp.arange(slots.shape[0]) < count
     return lines_of(m.anchor, line, m.segments_world.endpoints, raised, real)
 
@@ -225,55 +224,6 @@ def _associated(
 
 _narrowed = jax.jit(kf.narrowed, static_argnums=1)
 _shown = jax.jit(associate)
-
-
-def _apart(rules: SmoothingRules, problem: Problem, lines: Lines) -> tuple[Problem, Lines]:
-    """What is seen again after `rules.passing` metres is another line until it is found to be one.
-
-    Where a drive has drifted by as much as two edges are apart, as the foot and the top of a
-    baseboard, each is taken for the other and so are all beside them: no solution leads back.
-    """
-    frames = problem.keyframes
-    driven, known, name = map(np.array, (frames.driven, frames.known, frames.line))
-    passing = float(rules.passing)
-    at = np.nonzero(known)
-    order = np.lexsort((at[0], name[at]))
-    at = at[0][order], at[1][order]
-    old, way = name[at], driven[at[0]]
-    is_first = np.diff(old, prepend=-1) != 0
-    begins = is_first | (np.diff(way, prepend=0) > passing)
-    parent, group, ends = old[begins], np.cumsum(begins) - 1, np.roll(begins, -1)
-    enough = np.bincount(group, minlength=len(parent)) >= int(rules.min_sightings)
-    more, own = enough & ~is_first[begins], enough | is_first[begins]
-
-    count = int(lines.valid.sum())  # these come first
-    new = np.where(more, count + np.cumsum(more) - 1, parent)
-    total = count + int(more.sum())
-    size = kf.padded(max(total, 1), rules.room)
-    source = np.zeros(size, int)
-    source[:total] = np.append(np.arange(count), parent[more])
-    span = np.tile([-np.inf, np.inf], (size, 1))
-    span[new[own]] = np.stack([way[begins], way[ends]], axis=1)[own]
-    span += passing / 2 * np.array([-1, 1])
-    name[at], known[at] = new[group], enough[group]
-
-    lines = jax.tree.map(lambda a: a[source], lines)
-    lines = eqx.tree_at(
-        lambda l: (l.raised, l.vague, l.valid, l.span),
-        lines,
-        (
-            lines.raised | (np.arange(size) >= count),
-            jnp.arange(size) >= count,
-            jnp.arange(size) < total,
-            jnp.asarray(span),
-        ),
-    )
-    problem = eqx.tree_at(
-        lambda p: (p.start.line, p.keyframes.line, p.keyframes.known),
-        problem,
-        (lines.line, jnp.asarray(name), jnp.asarray(known)),
-    )
-    return problem, lines
 
 
 def _solved(
@@ -309,36 +259,10 @@ def _believed(config, problem: Problem) -> Problem:
     return eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
 
 
-def _renamed(problem: Problem, lines: Lines, name: np.ndarray):
-    """Lines that are one go on as one: their segments show it, and its reach is that of all."""
-    line, (first, last) = problem.keyframes.line, lines.span.T
-    span = jnp.stack([first.at[name].min(first), last.at[name].max(last)], axis=1)
-    valid = lines.valid & (name == np.arange(len(name)))
-    lines = eqx.tree_at(lambda l: (l.valid, l.span), lines, (valid, span))
-    line = jnp.asarray(name, line.dtype)[line]  # of the type that `_solve` was compiled for
-    return eqx.tree_at(lambda p: p.keyframes.line, problem, line), lines
-
-
 @jax.jit
 def _straight(config, problem: Problem, lines: Lines):
-    """Without lines that misfit what was seen of them by much more than pixels may, which no one
-    line has shown; and whether there were any.
-    """
-    frames, K = problem.keyframes, lines.valid.shape[0]
-    count = _sightings(frames, lines)
-    square = (distances(problem.start, problem) ** 2).sum(axis=2)
-    total = jnp.zeros(K).at[jnp.where(frames.known, frames.line, K)].add(square, mode="drop")
-    variance = total / jnp.maximum(2 * count - 2, 1).astype(total.dtype)
-    bent = lines.valid & (variance > (BENT * problem.priors.pixel_sigma) ** 2)
-    problem = eqx.tree_at(lambda p: p.keyframes.known, problem, frames.known & ~bent[frames.line])
-    lines = eqx.tree_at(lambda l: l.valid, lines, lines.valid & ~bent)
-    return _believed(config, problem), lines, bent.any()
-
-
-@jax.jit
-def _sightings(frames: Keyframes, lines: Lines) -> Int[Array, "K"]:
-    K = lines.valid.shape[0]
-    return jnp.zeros(K, int).at[jnp.where(frames.known, frames.line, K)].add(1, mode="drop")
+    problem, lines, bent = without_bent(problem, lines)
+    return _believed(config, problem), lines, bent
 
 
 def final_map(config: SlamConfig, rules: SmoothingRules, smoothed: Smoothed) -> FinalMap:

@@ -7,6 +7,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from sofjax.segment_map import on_floor
 from sofjax.smoothing.blocks import Jacobian
 from sofjax.smoothing.dissection import Dissection, dissect, divide
 from sofjax.smoothing.elimination import DissectionSolver, eliminate
@@ -100,7 +101,6 @@ def _solve(
     weak = jnp.diag(jnp.array([1e-2, 1e-2, 1 / problem.priors.kappa_sigma**2]))
     alone = jnp.linalg.inv(blocks.sighted + weak)
     free = unknowns.line - jnp.einsum("kij,kj->ki", alone, gradient)
-    gain = alone[:, :, 2] / alone[:, 2:, 2]
     return Solution(
         unknowns=unknowns,
         cost_before=_cost(residuals(problem.start, problem)),
@@ -110,7 +110,7 @@ def _solve(
         marginals=_if(sure, lambda: marginals(eliminate(blocks, dissection))),
         kappa_free=free[:, 2],
         kappa_sigma=jnp.sqrt(alone[:, 2, 2]),
-        on_floor=(free + gain * (1 - free[:, 2:])).at[:, 2].set(1),
+        on_floor=jax.vmap(on_floor)(free, alone),
     )
 
 
