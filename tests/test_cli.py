@@ -276,8 +276,12 @@ def test_ctrl_c_before_the_first_image(tmp_path, drive, monkeypatch):
 
 def test_a_real_ctrl_c(tmp_path):
     command = [sys.executable, "-m", "sofjax", "run", str(OFFICE), "--out", str(tmp_path), *SMALL]
-    command += ["--particles", "30000"]  # slow enough to be caught on a busy machine
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command += ["--particles", "5000"]  # slow enough to be caught on a busy machine
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # a shell's background jobs, and what they start, ignore Ctrl-C
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
     trajectory, patience = tmp_path / "trajectory.txt", time.monotonic() + 300
     while not (trajectory.exists() and trajectory.read_text().count("\n") > 5):
         assert process.poll() is None and time.monotonic() < patience, process.communicate()[1]
