@@ -275,13 +275,12 @@ def test_ctrl_c_before_the_first_image(tmp_path, drive, monkeypatch):
 
 
 def test_a_real_ctrl_c(tmp_path):
-    command = [sys.executable, "-m", "sofjax", "run", str(OFFICE), "--out", str(tmp_path), *SMALL]
+    # a shell's background jobs, and what they start, ignore Ctrl-C: the default is set back
+    program = "import signal, runpy; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    program += "runpy.run_module('sofjax', run_name='__main__')"
+    command = [sys.executable, "-c", program, "run", str(OFFICE), "--out", str(tmp_path), *SMALL]
     command += ["--particles", "5000"]  # slow enough to be caught on a busy machine
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # a shell's background jobs, and what they start, ignore Ctrl-C
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     trajectory, patience = tmp_path / "trajectory.txt", time.monotonic() + 300
     while not (trajectory.exists() and trajectory.read_text().count("\n") > 5):
         assert process.poll() is None and time.monotonic() < patience, process.communicate()[1]
