@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, segment_to_floor
 from sofjax.geometry.lines import (
@@ -105,6 +106,26 @@ def sight(
     # what is reported at the nominal tilt moves against the correction
     some = some & segments_image.valid
     return Sightings(endpoints, some, line, covariance, -tilt, log_area)
+
+
+PARALLEL = 0.05  # radians
+
+
+def free_direction(
+    sightings: Sightings, known: Bool[Array, "M"]
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """The direction along which the known lines run, if they all do: no pose along it is told from
+    another.
+
+    **Returns:** radians about the foot, and whether all run along it as far as can be seen.
+    """
+    theta, variance = (
+        jnp.where(known, a, 0) for a in (sightings.line.theta, sightings.covariance[:, 1, 1])
+    )
+    weight = jnp.where(known, 1 / (variance + PARALLEL**2), 0)
+    free = jnp.arctan2(weight @ jnp.sin(2 * theta), weight @ jnp.cos(2 * theta)) / 2
+    along = jnp.abs(jnp.sin(theta - free)) < PARALLEL + 3 * safe_sqrt(variance)
+    return free, (along | ~known).all() & known.any()
 
 
 def adapt_noise(

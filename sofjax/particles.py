@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.motion import OdometerBias
 
@@ -45,6 +46,52 @@ def systematic(key: PRNGKeyArray, log_weight: Float[Array, "N"]) -> Int[Array, "
     cumulative = jnp.cumsum(jnp.exp(log_weight))
     teeth = (jax.random.uniform(key) + jnp.arange(N, dtype=float)) / N * cumulative[-1]
     return jnp.clip(jnp.searchsorted(cumulative, teeth), 0, N - 1)
+
+
+def draw_across(
+    key: PRNGKeyArray,
+    particles: Particles,
+    T_tried: SE2,
+    log_likelihood: Float[Array, "N"],
+    free: Float[Array, ""],
+) -> Particles:
+    """The next generation, by a likelihood that says nothing of where along a direction one is.
+
+    Drawn as a whole, after some time all particles would have the place along it and the odometer's
+    scale of one ancestor, by chance, and be sure of them. So each takes of a drawn one what was
+    seen, the place across and the yaw, and keeps its own of what was not. The errors in turning
+    follow by regression on what is taken, as the yaw is what they are learned by.
+
+    **Arguments:**
+    - `T_tried`: [N] the poses that were compared: those of the particles and what these were tried
+      with besides, such as a slip of the wheels. Of that too only what was seen is taken.
+    - `free`: the direction, radians in the world.
+
+    **Returns:** particles of equal weights.
+    """
+    key_own, key_seen = jax.random.split(key)
+    own = systematic(key_own, particles.log_weight)  # all, each once, if their weights are equal
+    log_seen = log_likelihood[own]
+    seen = own[systematic(key_seen, log_seen - jax.nn.logsumexp(log_seen))]
+    particles = particles.take(own)
+
+    middle = mean_pose(particles)
+    turned = SE2(jnp.zeros(2), free)
+    local = lambda T: (turned.inverse().apply(T.xy - middle.xy), T.yaw - middle.yaw)
+    (xy, yaw), (tried_xy, tried_yaw) = map(
+        local, (particles.T_world_robot, jax.tree.map(lambda a: a[seen], T_tried))
+    )
+    before = jnp.stack([xy[:, 1], yaw], axis=1)
+    after = jnp.stack([tried_xy[:, 1], tried_yaw], axis=1)
+    b = particles.bias.mean
+    by_seen = inverse_2x2(before.T @ before + 1e-12 * jnp.eye(2)) @ (before.T @ (b - b.mean(0)))
+    by_seen = by_seen.at[:, 0].set(0)
+    xy = middle.xy + turned.apply(jnp.stack([xy[:, 0], tried_xy[:, 1]], axis=1))
+    return Particles(
+        SE2(xy, middle.yaw + tried_yaw),
+        OdometerBias(b + (after - before) @ by_seen, particles.bias.covariance),
+        particles.log_weight,
+    )
 
 
 def winner(log_weight: Float[Array, "N"]) -> Int[Array, "N"]:

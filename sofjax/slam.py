@@ -14,6 +14,7 @@ from sofjax.likelihood import (
     SensorModel,
     adapt_noise,
     compare,
+    free_direction,
     log_density,
     pixels_and_weight,
     sight,
@@ -22,6 +23,7 @@ from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, 
 from sofjax.observation import Observation
 from sofjax.particles import (
     Particles,
+    draw_across,
     effective_size,
     mean_pose,
     pose_covariance,
@@ -159,7 +161,8 @@ def step(
     slip, log_ratio = sample_slip(
         config.motion, observation.motion, state.noise < SURE, key_slip, (N,)
     )
-    T_world_robot = state.particles.T_world_robot @ motion @ slip
+    unslipped = Particles(state.particles.T_world_robot @ motion, bias, state.particles.log_weight)
+    T_world_robot = unslipped.T_world_robot @ slip
     prior = state.particles.log_weight + log_ratio
     moved = Particles(T_world_robot, bias, prior - jax.nn.logsumexp(prior))
     predicted = mean_pose(moved)
@@ -202,9 +205,18 @@ def step(
         particles = weighted.take(winner(weighted.log_weight))
         chosen = mean_pose(particles)
     else:
+        if not config.filter.soft:
+            likeliest = found.error[:, jnp.argmax(log_weight)]
+            free, parallel = free_direction(sightings, sightings.valid & (likeliest < sensor.e_max))
+            of_seen = log_ratio + log_likelihood, predicted.yaw + free
+            weighted = jax.lax.cond(
+                parallel,
+                lambda: draw_across(key_choice, unslipped, T_world_robot, *of_seen),
+                lambda: weighted,
+            )
         chosen = mean_pose(weighted)
         resampled = weighted.take(systematic(key_choice, weighted.log_weight), config.filter.soft)
-        few = size < config.filter.effective_share * N
+        few = effective_size(weighted.log_weight) < config.filter.effective_share * N
         particles = jax.tree.map(lambda a, b: jnp.where(few, a, b), resampled, weighted)
 
     # 6) integrate the observed segments into the map, as seen from the chosen pose
@@ -233,7 +245,7 @@ def step(
     info = StepInfo(
         T_world_robot=chosen,
         covariance=pose_covariance(weighted),
-        bias=jnp.exp(weighted.log_weight) @ bias.mean,
+        bias=jnp.exp(weighted.log_weight) @ weighted.bias.mean,
         effective_size=size,
         log_evidence=log_evidence,
         tilt=best.tilt,

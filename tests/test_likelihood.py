@@ -14,6 +14,7 @@ from sofjax.likelihood import (
     Sightings,
     adapt_noise,
     compare,
+    free_direction,
     mahalanobis,
     pixels_and_weight,
     sight,
@@ -363,6 +364,32 @@ def test_mahalanobis_is_the_matrix_product(rng):
     W = root @ np.swapaxes(root, -1, -2)
     expected = np.einsum("...i,...ij,...j->...", d, W, d)
     np.testing.assert_allclose(mahalanobis(jnp.asarray(d), jnp.asarray(W)), expected)
+
+
+def along(*theta, sigma=0.01):
+    theta = jnp.array(theta)
+    line = PolarLine(jnp.ones_like(theta), theta)
+    covariance = jnp.broadcast_to(jnp.diag(jnp.array([1e-4, sigma**2])), (len(theta), 2, 2))
+    none = jnp.zeros_like(covariance)
+    return Sightings(none, theta < 9, line, covariance, none)
+
+
+def test_lines_that_all_run_one_way_leave_it_free():
+    all_known = lambda s: free_direction(s, s.valid)
+    free, parallel = all_known(along(0.3, 0.32, 0.29, 0.3 + np.pi, 0.3 - np.pi))
+    assert parallel and np.sin(free - 0.3) == pytest.approx(0, abs=0.01)
+    assert not all_known(along(0.3, 0.3, 0.3, 0.5))[1]
+    assert not all_known(along(0.3, 0.3, 0.3, 0.3 + np.pi / 2))[1]
+    assert all_known(along(0.3, 0.3, 0.3, 0.5, sigma=0.1))[1]  # as far as can be seen
+    assert all_known(along(np.pi / 2, -np.pi / 2))[1]
+
+
+def test_what_is_not_known_tells_no_direction():
+    sightings = along(0.3, 0.31, 1.5)
+    assert free_direction(sightings, jnp.array([True, True, False]))[1]
+    assert not free_direction(sightings, jnp.array([True, True, True]))[1]
+    free, parallel = free_direction(sightings, jnp.zeros(3, bool))
+    assert not parallel and np.isfinite(free)
 
 
 def test_noise_is_believed_where_matches_disagree_and_never_below_the_model():

@@ -9,6 +9,7 @@ from sofjax.geometry import SE2
 from sofjax.motion import OdometerBias
 from sofjax.particles import (
     Particles,
+    draw_across,
     effective_size,
     mean_pose,
     pose_covariance,
@@ -129,3 +130,81 @@ def test_the_covariance_is_that_of_numpy(rng):
     found = pose_covariance(cloud(xy, jnp.array(yaw), log(*weights)))
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     assert not pose_covariance(cloud([[3, 4]], [0.1], log(1))).any()
+
+
+def corridor_cloud(rng, N, free=0.6, middle=(400.0, -300.0)):
+    """Particles about a direction, whose curvatures go with their yaws; along, across, yaw."""
+    along, across, yaw, scale = rng.normal(0, [0.3, 0.01, 0.004, 0.01], size=(N, 4)).T
+    curvature = 0.5 * yaw + rng.normal(0, 0.001, N)
+    c, s = np.cos(free), np.sin(free)
+    xy = np.array(middle) + np.column_stack([c * along - s * across, s * along + c * across])
+    b = np.column_stack([scale, np.zeros(N), np.zeros(N), curvature])
+    T = SE2(jnp.asarray(xy), jnp.asarray(free + yaw))
+    bias = OdometerBias(jnp.asarray(b), jnp.eye(4))
+    return Particles(T, bias, jnp.full(N, -jnp.log(N), float)), (along, across, yaw)
+
+
+def places(particles, free=0.6, middle=(400.0, -300.0)):
+    d = np.asarray(particles.T_world_robot.xy) - middle
+    c, s = np.cos(free), np.sin(free)
+    return d @ [c, s], d @ [-s, c], np.asarray(particles.T_world_robot.yaw) - free
+
+
+def test_what_was_not_seen_stays_each_particle_s_own(rng, x64):
+    """However often is drawn: the places along the way and the scales are those that they were."""
+    particles, (along, *_) = corridor_cloud(rng, 500)
+    for key in KEYS:
+        _, across, yaw = places(particles)
+        log_likelihood = jnp.asarray(-0.5 * ((across - 0.002) / 0.01) ** 2)
+        drawn = draw_across(key, particles, particles.T_world_robot, log_likelihood, jnp.array(0.6))
+        np.testing.assert_allclose(places(drawn)[0], along, atol=1e-9)
+        np.testing.assert_array_equal(drawn.bias.mean[:, 0], particles.bias.mean[:, 0])
+        pairs = set(zip(across.round(9), yaw.round(9), strict=True))
+        assert set(zip(*(a.round(9) for a in places(drawn)[1:]), strict=True)) <= pairs
+        particles = drawn
+    assert np.std(places(particles)[1]) < 0.005  # while that of what was seen has narrowed
+
+
+def test_what_was_seen_is_drawn_by_its_likelihood_and_teaches_the_errors_in_turning(rng, x64):
+    """Gauss: the yaw's posterior is that of Bayes, and the curvature follows as Kalman's would."""
+    particles, (_, _, yaw) = corridor_cloud(rng, 20_000)
+    log_likelihood = jnp.asarray(-0.5 * ((yaw - 0.003) / 0.003) ** 2)
+    drawn = draw_across(KEYS[0], particles, particles.T_world_robot, log_likelihood, jnp.array(0.6))
+    gain = 0.004**2 / (0.004**2 + 0.003**2)
+    _, _, found = places(drawn)
+    assert found.mean() == pytest.approx(0.003 * gain, rel=0.03)
+    assert found.std() == pytest.approx(0.004 * np.sqrt(1 - gain), rel=0.03)
+    learned = np.asarray(drawn.bias.mean[:, 3])
+    assert learned.mean() == pytest.approx(0.5 * 0.003 * gain, rel=0.05)
+    expected = np.sqrt(0.001**2 + 0.5**2 * 0.004**2 * (1 - gain))
+    assert learned.std() == pytest.approx(expected, rel=0.03)
+    assert np.corrcoef(learned, found)[0, 1] > 0.6
+
+
+def test_of_what_was_tried_only_what_was_seen_is_taken(rng, x64):
+    particles, (along, across, yaw) = corridor_cloud(rng, 200)
+    T = particles.T_world_robot
+    tried = SE2(T.xy.at[7].add(5.0), T.yaw.at[7].add(0.2))  # one slipped, and alone is right
+    log_likelihood = jnp.full(200, -1000.0).at[7].set(0)
+    drawn = draw_across(KEYS[0], particles, tried, log_likelihood, jnp.array(0.6))
+    c, s = np.cos(0.6), np.sin(0.6)
+    np.testing.assert_allclose(places(drawn)[0], along, atol=1e-9)
+    np.testing.assert_allclose(places(drawn)[1], across[7] + 5 * (c - s), atol=1e-9)
+    np.testing.assert_allclose(places(drawn)[2], yaw[7] + 0.2, atol=1e-9)
+
+
+def test_weights_from_before_are_those_of_whole_particles(rng, x64):
+    particles, (along, across, *_) = corridor_cloud(rng, 100)
+    weights = jnp.where(jnp.arange(100) < 25, jnp.log(0.04), -1e3)
+    particles = Particles(particles.T_world_robot, particles.bias, weights)
+    drawn = draw_across(KEYS[0], particles, particles.T_world_robot, jnp.zeros(100), jnp.array(0.6))
+    np.testing.assert_allclose(np.unique(places(drawn)[0].round(9)), np.sort(along[:25].round(9)))
+    np.testing.assert_allclose(np.unique(places(drawn)[1].round(9)), np.sort(across[:25].round(9)))
+    np.testing.assert_allclose(jnp.exp(drawn.log_weight), 0.01)
+
+
+def test_a_cloud_in_one_point_stays_there(x64):
+    particles = cloud(np.tile([3.0, 4.0], (8, 1)), np.full(8, 0.1), jnp.full(8, -jnp.log(8)))
+    drawn = draw_across(KEYS[0], particles, particles.T_world_robot, jnp.zeros(8), jnp.array(0.1))
+    np.testing.assert_allclose(drawn.T_world_robot.xy, particles.T_world_robot.xy)
+    np.testing.assert_allclose(drawn.bias.mean, particles.bias.mean)

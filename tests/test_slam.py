@@ -174,6 +174,27 @@ def test_a_wheel_that_spins_is_found_out():
     assert trajectory_error(infos.T_world_robot.xy) < 0.02
 
 
+def test_where_all_lines_run_along_the_way_the_distance_is_the_odometer_s_and_as_unsure():
+    """20 m in a corridor without a line across: the spread is that of the odometer's scale, 1 %."""
+    rng = np.random.default_rng(3)
+    walls = np.array([[[-5, y], [60, y]] for y in (-1.2, -0.7, 0.5, 1.1)])
+    forward = SE2(jnp.array([0.2, 0]), jnp.zeros(()))
+
+    def observation(i):
+        seen = reference.look(CAMERA, MOUNT, [0.2 * i, 0, 0], walls)
+        ends = jnp.zeros((M, 2, 2)).at[: len(seen)].set(seen + rng.normal(0, 0.3, seen.shape))
+        motion = forward if i else SE2.identity()
+        return Observation(Segments(ends, jnp.arange(M) < len(seen)), motion, jnp.zeros((), int))
+
+    _, info = stepped(map(observation, range(101)))
+    assert info.matched[20:].min() >= 3 and not info.across.any()
+    x, sigma = info.T_world_robot.xy[-1, 0], info.covariance[-1, 0, 0] ** 0.5
+    assert x == pytest.approx(20, abs=0.06)
+    assert sigma == pytest.approx(0.2, rel=0.3)
+    assert abs(info.T_world_robot.xy[:, 1]).max() < 0.02
+    assert info.covariance[-1, 1, 1] ** 0.5 < 0.01
+
+
 def test_a_scan_is_one_step_after_the_other():
     """In float64: the compiler rounds a loop's body otherwise, and resampling magnifies that."""
     # indices of top_k stay int32
