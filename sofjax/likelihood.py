@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
-from sofjax.geometry.floor import floor_homography, segment_to_floor
+from sofjax.geometry.floor import floor_homography, may_be_upright, segment_to_floor
 from sofjax.geometry.lines import (
     PolarLine,
     alignment,
@@ -33,6 +33,7 @@ class SensorModel(eqx.Module):
     tilt_sigma: float = 0.001  # radians, wobble of pitch and of roll from image to image
     rho_sigma: float = 0.02  # metres; the constant sigmas, and with `propagate` ...
     theta_sigma: float = 0.02  # radians; ... unused
+    upright: float = 1.0  # pixels that the ends of an upright edge may be off a line to the foot
     theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
     adaptation: float = 0.3  # share of the surplus misfit by which the noise grows in a step
     noise_gate: float = 4.0  # multiple of the variance up to which it widens what may match; ...
@@ -49,6 +50,7 @@ class Sightings(eqx.Module):
     covariance: Float[Array, "*batch 2 2"]  # of (rho, theta), from noise of the end points alone
     tilt: Float[Array, "*batch 2 2"]  # d(rho, theta) / d(pitch, roll) of the camera's wobble
     log_area: Float[Array, "*batch"] | float = 0.0  # log of (metres · radians) that a pixel² makes
+    upright: Bool[Array, "*batch"] | bool = False  # it may be: no line of the map begins with it
 
     def under_tilt(self, tilt: Float[Array, "2"]) -> PolarLine:
         """The lines, corrected for a wobble (pitch, roll) of the mount."""
@@ -103,9 +105,13 @@ def sight(
         tilt = jnp.zeros_like(tilt)
     has_length = (segments_image.endpoints[:, 0] != segments_image.endpoints[:, 1]).any(axis=-1)
     some = some & has_length & (covariance[:, 1, 1] < sensor.theta_limit**2)
+    foot_image = floor_homography(camera, mount, SE2.identity()) @ jnp.append(foot, 1)
+    upright = jax.vmap(may_be_upright, in_axes=(None, 0, None))(
+        foot_image, segments_image.endpoints, sensor.upright
+    )
     # what is reported at the nominal tilt moves against the correction
     some = some & segments_image.valid
-    return Sightings(endpoints, some, line, covariance, -tilt, log_area)
+    return Sightings(endpoints, some, line, covariance, -tilt, log_area, upright)
 
 
 PARALLEL = 0.05  # radians

@@ -19,7 +19,9 @@ PAPER = SlamConfig(
         curvature_sigma=0.0,
         slip_rate=0.0,
     ),
-    sensor=SensorModel(propagate=False, rho_sigma=0.05, theta_sigma=0.035, tilt_sigma=0.0),
+    sensor=SensorModel(
+        propagate=False, rho_sigma=0.05, theta_sigma=0.035, tilt_sigma=0.0, upright=0.0
+    ),
     segment_map=MapRules(
         rule="gamma",
         classify=False,

@@ -226,7 +226,7 @@ def step(
         sensor, sightings, candidates, T_world_foot.between(T_world_foot_chosen), counted
     )
     known = counted & (best.error < sensor.e_max)
-    new = is_sof & (nearest > sensor.e_max) & counted & ~known
+    new = is_sof & (nearest > sensor.e_max) & counted & ~known & ~sightings.upright
     segment_map, overflow = integrate(
         rules, sensor, state.segment_map, near, sightings,
         jnp.take_along_axis(at, best.choice[:, None], 1)[:, 0], at,

@@ -16,6 +16,7 @@ from sofjax.geometry import (
     line_through,
     line_to_floor,
     line_to_image,
+    may_be_upright,
     projection_matrix,
     segment_to_floor,
 )
@@ -242,6 +243,22 @@ def test_an_upright_line_meets_the_floor_where_its_two_floor_lines_cross(camera,
         for H, x in ((H_F, l), (H_F2, l2)):
             L = line_to_floor(H, jnp.asarray(x))
             assert abs(L @ jnp.append(foot, 1.0)) < 1e-8 * jnp.linalg.norm(L)
+
+
+def test_uprights_point_to_the_foot_and_lines_of_the_floor_beside_it_do_not(camera, mounts):
+    for mount in mounts:
+        T, foot, ahead = SE2.identity(), mount.T_robot_foot.xy, SE2(jnp.zeros(2), mount.yaw)
+        H_F, P = floor_homography(camera, mount, T), projection_matrix(camera, mount, T)
+        foot_image = H_F @ jnp.append(foot, 1.0)
+        place = foot + ahead.apply(jnp.array([2.0, 0.7]))
+        edge = jnp.array([[*place, 0.1, 1.0], [*place, 0.6, 1.0]]) @ P.T
+        edge = edge[:, :2] / edge[:, 2:]
+        assert may_be_upright(foot_image, edge, 1e-6)
+        for y, pointing in ((0.0, True), (0.3, False), (-0.3, False)):
+            ends = foot + ahead.apply(jnp.array([[2.0, y], [3.0, y]]))
+            on_floor, before = to_image(H_F, ends)
+            assert before.all() and may_be_upright(foot_image, on_floor, 1.0) == pointing
+            assert not may_be_upright(foot_image, on_floor, 0.0)
 
 
 def test_float32_is_good_to_a_millimetre_at_five_metres(camera, mount, rng):

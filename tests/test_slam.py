@@ -13,7 +13,7 @@ import reference
 from conftest import jit_quickly, make_camera
 
 from sofjax import slam
-from sofjax.geometry import SE2, Mount, Segments
+from sofjax.geometry import SE2, Mount, Segments, projection_matrix
 from sofjax.motion import MotionModel
 from sofjax.observation import Observation
 from sofjax.presets import DEFAULT, PAPER
@@ -193,6 +193,26 @@ def test_where_all_lines_run_along_the_way_the_distance_is_the_odometer_s_and_as
     assert sigma == pytest.approx(0.2, rel=0.3)
     assert abs(info.T_world_robot.xy[:, 1]).max() < 0.02
     assert info.covariance[-1, 1, 1] ** 0.5 < 0.01
+
+
+def test_edges_of_doors_are_never_born():
+    """From one image to the next an upright edge moves as a line of the floor may."""
+    doors = np.array([[1.6, 0.8], [2.2, -0.9], [3.0, 1.1], [3.4, -0.3]])
+    edges = np.stack([np.insert(doors, 2, 0.0, axis=1), np.insert(doors, 2, 0.5, axis=1)], axis=1)
+    rng = np.random.default_rng(2)
+    state, info = start(), None
+    for i in range(12):
+        pose = [0.08 * i, 0.01 * i, 0.01 * i]
+        T = SE2(jnp.asarray(pose[:2], float), jnp.asarray(pose[2], float))
+        x = np.insert(edges, 3, 1.0, axis=2) @ np.asarray(projection_matrix(CAMERA, MOUNT, T)).T
+        seen = x[..., :2] / x[..., 2:] + rng.normal(0, 0.2, (len(doors), 2, 2))
+        ends = jnp.zeros((M, 2, 2)).at[: len(doors)].set(seen)
+        motion = SE2(jnp.array([0.08, 0.01]), jnp.array(0.01, float)) if i else SE2.identity()
+        segments = Segments(ends, jnp.arange(M) < len(doors))
+        observation = Observation(segments, motion, jnp.zeros((), int))
+        state, info = step(CONFIG, CAMERA, MOUNT, state, observation)
+        assert info.below_horizon >= 3
+    assert not state.segment_map.valid.any()
 
 
 def test_a_scan_is_one_step_after_the_other():

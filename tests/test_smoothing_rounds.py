@@ -111,6 +111,7 @@ def test_a_segment_shows_the_nearest_line_that_reaches_it():
     index, known = associate(
         Seeing(),
         8.0,
+        1.0,
         CAMERA,
         MOUNT,
         lines,
@@ -137,7 +138,9 @@ def test_what_may_be_upright_or_was_passed_shows_no_line(y, driven, shows):
     ends = jax.vmap(lambda p: floor_to_image(H_F, p)[0])(jnp.array([[1.2, y], [1.8, y]]))
     seen = Segments(ends[None, None], jnp.ones((1, 1), bool))
     unknowns = Unknowns(jnp.zeros((1, 5)), lines.line, jnp.zeros(8))
-    _, known = associate(Seeing(), 8.0, CAMERA, MOUNT, lines, unknowns, seen, jnp.array([driven]))
+    _, known = associate(
+        Seeing(), 8.0, 1.0, CAMERA, MOUNT, lines, unknowns, seen, jnp.array([driven])
+    )
     assert bool(known[0, 0]) == shows
 
 

@@ -8,6 +8,7 @@ from sofjax.geometry.floor import floor_to_image as floor_to_image
 from sofjax.geometry.floor import image_to_floor as image_to_floor
 from sofjax.geometry.floor import line_to_floor as line_to_floor
 from sofjax.geometry.floor import line_to_image as line_to_image
+from sofjax.geometry.floor import may_be_upright as may_be_upright
 from sofjax.geometry.floor import segment_to_floor as segment_to_floor
 from sofjax.geometry.lines import PolarLine as PolarLine
 from sofjax.geometry.lines import line_through as line_through

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sofjax.geometry.camera import Camera, Mount, projection_matrix
+from sofjax.geometry.lines import line_point_distance
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import clip
 
@@ -47,6 +48,20 @@ def floor_to_image(
     x, y, depth = H_F @ jnp.append(point_floor, 1.0)
     visible = depth > 0
     return jnp.stack([x, y]) / jnp.where(visible, depth, 1), visible
+
+
+def may_be_upright(
+    foot_image: Float[Array, "3"],
+    segment_image: Float[Array, "2 2"],
+    gate: Float[Array, ""] | float,
+) -> Bool[Array, ""]:
+    """Whether a segment's ends are within `gate` pixels of a line through its middle and the foot.
+
+    The image of the foot (homogeneous) is where the images of all uprights meet: an edge of a door
+    or a box always points there, and for a short way moves like a line of the floor.
+    """
+    line = jnp.cross(foot_image, jnp.append(segment_image.mean(axis=0), 1))
+    return jnp.abs(line_point_distance(line, segment_image[0])) < gate
 
 
 def segment_to_floor(

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.angles import safe_norm
 from sofjax.geometry.camera import Camera, Mount
-from sofjax.geometry.floor import floor_homography, segment_to_floor
+from sofjax.geometry.floor import floor_homography, may_be_upright, segment_to_floor
 from sofjax.geometry.lines import PolarLine, cofactor, direction, line_point_distance, normal
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments, overlap
@@ -55,20 +55,18 @@ class Seeing(eqx.Module):
     gate: float = 3.0  # pixels that an end may be off its line
     angle: float = 0.15  # radians between a segment and its line in the image
     join_gap: float = 0.1  # metres that a segment may lie beyond what was seen of its line
-    upright: float = 1.0  # pixels that an end may be off a line through the foot: may be upright
 
 
 def associate(
-    seeing: Seeing, max_depth: Float[Array, ""] | float, camera: Camera, mount: Mount,
-    lines: Lines, unknowns: Unknowns, segments_image: Segments, driven: Float[Array, "n"],
+    seeing: Seeing, max_depth: Float[Array, ""] | float, upright_gate: Float[Array, ""] | float,
+    camera: Camera, mount: Mount, lines: Lines, unknowns: Unknowns, segments_image: Segments,
+    driven: Float[Array, "n"],
 ) -> tuple[Int[Array, "n M"], Bool[Array, "n M"]]:  # fmt: skip
     """For each segment of each keyframe the line that lies nearest to both of its ends, in pixels.
 
-    An upright edge, of a door or a box, always points to the foot, and from a short way looks like
-    a line of the floor: what points there shows no line.
-
     **Arguments:**
     - `max_depth`: metres; what is farther is not used.
+    - `upright_gate`: pixels, of `may_be_upright`; what may be shows no line.
     - `driven`: metres, at each keyframe.
 
     **Returns:** the line's index, and whether there is one within the gates.
@@ -96,8 +94,8 @@ def associate(
             H_F, endpoints, jnp.asarray(max_depth, pose.dtype)
         )
         shared = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))
-        upright = jax.vmap(_points_to, in_axes=(0, None, None))(
-            endpoints, H_F[:, 2], seeing.upright
+        upright = jax.vmap(may_be_upright, in_axes=(None, 0, None))(
+            H_F[:, 2], endpoints, jnp.asarray(upright_gate, pose.dtype)
         )
         possible = (
             (jnp.maximum(jnp.abs(first), jnp.abs(second)) < seeing.gate)
@@ -111,17 +109,6 @@ def associate(
 
     each = (unknowns.pose, segments_image.endpoints, segments_image.valid, driven)
     return jax.lax.map(of_keyframe, each, batch_size=8)
-
-
-def _points_to(
-    segment: Float[Array, "2 2"], place: Float[Array, "3"], gate: Float[Array, ""] | float
-) -> Bool[Array, ""]:
-    """Whether the ends are within `gate` of the line through a place (homogeneous) and the middle.
-
-    Both in pixels.
-    """
-    line = jnp.cross(place, jnp.append(segment.mean(axis=0), 1))
-    return jnp.abs(line_point_distance(line, segment[0])) < gate
 
 
 def _from_origin(ends: Float[Array, "2 2"]) -> Float[Array, ""]:

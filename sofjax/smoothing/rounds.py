@@ -128,13 +128,13 @@ def smooth(
             costs.append((float(solution.cost_before), float(solution.cost)))
             return problem, lines, solution
 
-        problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
+        problem = _associated(config, rules, problem, lines, frames)
         problem, lines = apart(
             problem, lines, float(rules.passing), int(rules.min_sightings), rules.room
         )
         for left in reversed(range(rules.rounds)):
             if left < rules.rounds - 1:
-                problem = _associated(rules.seeing, config.filter.max_depth, problem, lines, frames)
+                problem = _associated(config, rules, problem, lines, frames)
             tolerance = ROUGH if left else TOLERANCE
             problem, lines, solution = solved(problem, lines, tolerance)
             problem, lines, bent = _straight(config, problem, lines)
@@ -205,12 +205,12 @@ def _start(path: Path, at: np.ndarray, lines: Lines) -> Unknowns:
 
 
 def _associated(
-    seeing: Seeing, max_depth: Array, problem: Problem, lines: Lines, frames: Keyframes
+    config: SlamConfig, rules: SmoothingRules, problem: Problem, lines: Lines, frames: Keyframes
 ) -> Problem:
     """With the lines that the segments of `frames` show by the present estimate, and only those."""
     line, known = _shown(
-        seeing, max_depth, problem.camera, problem.mount, lines, problem.start,
-        frames.segments_image, frames.driven,
+        rules.seeing, config.filter.max_depth, config.sensor.upright, problem.camera, problem.mount,
+        lines, problem.start, frames.segments_image, frames.driven,
     )  # fmt: skip
     frames = eqx.tree_at(lambda f: (f.line, f.known), frames, (line, known))
     most = int(known.sum(axis=1).max())
