@@ -165,8 +165,8 @@ def warnings(drive: Drive, tally: Tally) -> list[str]:
         )
     if tally.step["map_hidden"]:
         found.append(
-            f"more lines lay within sight than are compared, {tally.step['map_hidden'] / n:.0f} an "
-            "image on average; segment_map.nearby makes room"
+            f"more lines lay within sight than are compared, {tally.step['map_hidden']} too many "
+            f"in {n} images; segment_map.nearby makes room"
         )
     if tally.unheld > UNHELD:
         found.append(
