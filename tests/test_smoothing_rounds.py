@@ -240,6 +240,24 @@ def known(joint):
     return Marginals(factors, (within,), jnp.zeros((1, 5, 5)))
 
 
+@pytest.mark.parametrize(
+    ("kappa", "sigma", "raised", "is_shown"),
+    [
+        (1.01, 0.01, False, True),
+        (1.10, 0.02, True, False),
+        (1.02, 0.04, True, True),  # its height was left free; it would be the floor's
+        (1.10, 0.04, True, False),  # ... or the top of a baseboard's
+        (1.02, 0.10, True, False),  # ... or anything
+    ],
+)
+def test_lines_of_the_floor_are_shown(kappa, sigma, raised, is_shown):
+    lines = lines_along_x([0.3], [(1, 2)])
+    vague = raised and sigma > SmoothingRules().kappa_known
+    lines = replace(lines, raised=jnp.array([raised]), vague=jnp.array([vague]))
+    told = rounds.shown(MapRules(), SmoothingRules(), lines, jnp.array([kappa]), jnp.array([sigma]))
+    assert bool(told[0]) == is_shown
+
+
 def test_names_are_handed_on_to_the_end():
     into = np.array([0, 0, 1, 3])
     assert representatives(into, np.array([False, True, True, False])).tolist() == [0, 0, 0, 3]

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
@@ -45,7 +45,8 @@ class SmoothingRules(eqx.Module):
     turn: float = 0.1  # ... or radians
     min_sightings: int = 3  # keyframes that a line takes
     room: int = eqx.field(static=True, default=kf.PAD)  # least sizes of what is compiled
-    kappa_known: float = 0.03  # standard deviation below which a line may be one of the final map
+    kappa_known: float = 0.03  # standard deviation from which on a line's height is left free ...
+    kappa_shown: float = 0.05  # ... and up to which it may yet be one of the final map
     passing: float = 10.0  # metres driven after which what is seen again is told anew
     seeing: Seeing = Seeing()
 
@@ -266,21 +267,36 @@ def _straight(config, problem: Problem, lines: Lines):
 
 
 def final_map(config: SlamConfig, rules: SmoothingRules, smoothed: Smoothed) -> FinalMap:
-    """The lines seen often enough whose height is known, and known to be the floor's.
-
-    What runs along the way of the robot hardly changes its magnification: the top of a baseboard
-    that was only ever passed by is neither told from the floor nor kept.
-    """
-    lines, solution = smoothed.lines, smoothed.solution
-    often = smoothed.sightings >= config.segment_map.min_updates
+    """The lines seen often enough that are the floor's; with the height that each would have."""
+    solution = smoothed.solution
     kappa, sigma = solution.kappa_free, solution.kappa_sigma
-    known = sigma < rules.kappa_known
+    often = smoothed.sightings >= config.segment_map.min_updates
     with jax.enable_x64(True):
         found = FinalMap(
             endpoints_world=jnp.asarray(smoothed.endpoints_world),
-            is_floor=jnp.asarray(lines.valid & ~lines.raised & often & known),
+            is_floor=jnp.asarray(
+                often & shown(config.segment_map, rules, smoothed.lines, kappa, sigma)
+            ),
             updates=jnp.asarray(smoothed.sightings),
             height=jnp.asarray(smoothed.mount.height * (1 - 1 / kappa)),
             height_sigma=jnp.asarray(smoothed.mount.height * sigma / kappa**2),
         )
         return jax.device_get(found)
+
+
+def shown(
+    m: MapRules,
+    rules: SmoothingRules,
+    lines: Lines,
+    kappa: Float[Array, "K"],
+    sigma: Float[Array, "K"],
+) -> Bool[Array, "K"]:
+    """The lines whose height is known, and known to be the floor's.
+
+    What runs along the way of the robot hardly changes its magnification: the top of a baseboard
+    that was only ever passed by is neither told from the floor nor shown. What is nearly known, and
+    would be the floor's, is.
+    """
+    inside = (kappa > m.kappa_below) & (kappa < m.kappa_above)
+    floor = ~lines.raised | (lines.vague & inside)
+    return lines.valid & floor & (sigma < rules.kappa_shown)
