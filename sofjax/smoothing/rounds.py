@@ -288,9 +288,9 @@ def shown(
     m: MapRules,
     rules: SmoothingRules,
     lines: Lines,
-    kappa: Float[Array, "K"],
-    sigma: Float[Array, "K"],
-) -> Bool[Array, "K"]:
+    kappa: Float[Array | np.ndarray, "K"],
+    sigma: Float[Array | np.ndarray, "K"],
+) -> Bool[Array | np.ndarray, "K"]:
     """The lines whose height is known, and known to be the floor's.
 
     What runs along the way of the robot hardly changes its magnification: the top of a baseboard
