@@ -192,3 +192,12 @@ def pyplot():
     import matplotlib.pyplot as plt
 
     return plt
+
+
+def plain_ticks(axis) -> None:
+    """A logarithmic axis at 1, 2, 5 and so on, in numbers as one writes them."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter("{x:g}")

@@ -161,10 +161,8 @@ def draw(rows: list[dict], path: Path) -> None:
     left.set(
         xscale="log", yscale="log", xlabel="ATE while driving, % of the way", ylabel="ATE smoothed"
     )
-    ticks = [t for t in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2) if low <= t <= high]
     for axis in (left.xaxis, left.yaxis):
-        axis.set_ticks(ticks, [f"{t:g}" for t in ticks])
-    left.minorticks_off()
+        common.plain_ticks(axis)
     left.legend()
     x = np.geomspace(0.05, 100, 200)
     right.plot(x, chi2.cdf(x, 3), "k--", label="as it should be")

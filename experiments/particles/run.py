@@ -66,10 +66,7 @@ def draw(table: dict[int, dict], path: Path) -> None:
     middle = [100 * table[N]["median_m"] for N in of_all]
     left.plot(of_all, middle, "o-", color="#c0392b", label="median")
     left.set(xscale="log", yscale="log", xlabel="particles", ylabel="ATE, cm; grey: each drive")
-    low, high = left.get_ylim()
-    ticks = [t for t in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low <= t <= high]
-    left.yaxis.set_ticks(ticks, [f"{t:g}" for t in ticks])
-    left.minorticks_off()
+    common.plain_ticks(left.yaxis)
     left.legend()
     for key, label in (("cpu_ms", "CPU"), ("wall_ms", "wall")):
         right.plot(sizes, [table[N][key] for N in sizes], "o-", label=label)

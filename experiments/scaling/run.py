@@ -68,13 +68,16 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
 
 
 def draw(table: dict, path: Path) -> None:
-    plot, axes = common.pyplot().subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+    plot, axes = common.pyplot().subplots(
+        1, 3, figsize=(12, 3.6), layout="constrained", sharey=True
+    )
     for axis, (name, rows) in zip(axes, table.items(), strict=True):
         sizes = [int(size) for size in rows]
         for key, label in (("cpu_ms", "CPU"), ("wall_ms", "wall")):
             axis.plot(sizes, [row[key] for row in rows.values()], "o-", ms=4, label=label)
         others = ", ".join(f"{v} {k}" for k, v in USUAL.items() if k != name)
         axis.set(xscale="log", yscale="log", xlabel=name, ylabel="ms a step", title=others)
+        common.plain_ticks(axis.yaxis)
         axis.legend()
     plot.savefig(path, dpi=110)
 
