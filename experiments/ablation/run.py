@@ -171,6 +171,7 @@ def draw(tables: dict[str, dict], path: Path) -> None:
         axes.axvline(1, color="grey", lw=0.8)
         axes.set_yticks(range(len(names)), names)
         axes.set(xscale="log", title=source, xlabel="error, times that of the defaults (95 %)")
+        common.plain_ticks(axes.xaxis)
     every[0][0].invert_yaxis()
     every[0][0].legend(fontsize=8)
     plot.savefig(path, dpi=110)
