@@ -84,8 +84,9 @@ def draw_across(
     before = jnp.stack([xy[:, 1], yaw], axis=1)
     after = jnp.stack([tried_xy[:, 1], tried_yaw], axis=1)
     b = particles.bias.mean
-    by_seen = inverse_2x2(before.T @ before + 1e-12 * jnp.eye(2)) @ (before.T @ (b - b.mean(0)))
-    by_seen = by_seen.at[:, 0].set(0)
+    tiny = 1e-12 * jnp.eye(2)  # for a cloud in one point
+    by_seen = inverse_2x2(before.T @ before + tiny) @ (before.T @ (b - b.mean(axis=0)))
+    by_seen = by_seen.at[:, 0].set(0)  # scale and yaw go together by chance, which would add up
     xy = middle.xy + turned.apply(jnp.stack([xy[:, 0], tried_xy[:, 1]], axis=1))
     return Particles(
         SE2(xy, middle.yaw + tried_yaw),

@@ -1,9 +1,9 @@
 """Named settings: what is best, and the paper to the letter."""
 
 from sofjax.association import Association
-from sofjax.likelihood import SensorModel
 from sofjax.motion import MotionModel
 from sofjax.segment_map import MapRules
+from sofjax.sightings import SensorModel
 from sofjax.slam import FilterRules, SlamConfig
 
 DEFAULT = SlamConfig()

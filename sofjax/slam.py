@@ -10,15 +10,7 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-from sofjax.likelihood import (
-    SensorModel,
-    adapt_noise,
-    compare,
-    free_direction,
-    log_density,
-    pixels_and_weight,
-    sight,
-)
+from sofjax.likelihood import adapt_noise, compare, log_density, pixels_and_weight
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, sample_slip
 from sofjax.observation import Observation
 from sofjax.particles import (
@@ -40,6 +32,7 @@ from sofjax.segment_map import (
     nearby,
     propose,
 )
+from sofjax.sightings import SensorModel, free_direction, sight
 from sofjax.sof import SofExtraction, View, extract, keep_views, view_a_baseline_away
 
 SURE = 1.5  # noise up to which the sensor may convict the wheels of a slip
@@ -205,7 +198,7 @@ def step(
         particles = weighted.take(winner(weighted.log_weight))
         chosen = mean_pose(particles)
     else:
-        if not config.filter.soft:
+        if not config.filter.soft:  # whose gradient needs particles that are drawn as a whole
             likeliest = found.error[:, jnp.argmax(log_weight)]
             free, parallel = free_direction(sightings, sightings.valid & (likeliest < sensor.e_max))
             of_seen = log_ratio + log_likelihood, predicted.yaw + free

@@ -34,9 +34,10 @@ from sofjax.geometry import (
 from sofjax.geometry.lines import line_point_distance, polar_in_frame, polar_through
 from sofjax.geometry.segments import clip
 from sofjax.geometry.two_view import transfer_segment
-from sofjax.likelihood import Candidates, SensorModel, Sightings, compare, sight
+from sofjax.likelihood import Candidates, compare
 from sofjax.motion import MotionModel, prior_bias, sample_motion, sample_slip
 from sofjax.segment_map import MapRules, appear, believed
+from sofjax.sightings import SensorModel, Sightings, sight
 
 pytestmark = pytest.mark.usefixtures("x64")
 

@@ -12,7 +12,6 @@ from conftest import jit_quickly
 
 from sofjax.geometry import SE2, Mount, PolarLine, Segments
 from sofjax.geometry.lines import polar_through
-from sofjax.likelihood import SensorModel, Sightings
 from sofjax.segment_map import (
     MapRules,
     SegmentMap,
@@ -25,6 +24,7 @@ from sofjax.segment_map import (
     nearby,
     propose,
 )
+from sofjax.sightings import SensorModel, Sightings
 
 pytestmark = pytest.mark.usefixtures("x64")
 

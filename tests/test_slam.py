@@ -65,7 +65,7 @@ def drive():
     segments = Segments(jnp.asarray(ends, "float32"), jnp.arange(M) < jnp.asarray(counts)[:, None])
     motion = SE2.exp(jnp.asarray(read, "float32"))
     return np.array([reference.pose_of(m) for m in true]), Observation(
-        segments, motion, jnp.zeros(T, int)
+        segments, motion, jnp.zeros(T, "int32")
     )
 
 

@@ -16,10 +16,11 @@ from test_likelihood import as_arrays, random_problem
 from sofjax import slam
 from sofjax.association import Association, gate_probability
 from sofjax.geometry import SE2
-from sofjax.likelihood import SensorModel, log_density
+from sofjax.likelihood import log_density
 from sofjax.motion import OdometerBias
 from sofjax.particles import Particles, systematic
 from sofjax.presets import DEFAULT
+from sofjax.sightings import SensorModel
 
 pytestmark = pytest.mark.usefixtures("x64")
 

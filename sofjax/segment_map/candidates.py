@@ -10,8 +10,9 @@ from sofjax.geometry.lines import PolarLine, alignment, polar_differences, renam
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
-from sofjax.likelihood import Candidates, SensorModel, Sightings
+from sofjax.likelihood import Candidates
 from sofjax.segment_map.lines import MapRules, SegmentMap, appear, believed
+from sofjax.sightings import SensorModel, Sightings
 
 NOTHING = np.iinfo(np.int32).max
 

@@ -18,8 +18,8 @@ from sofjax.geometry.lines import (
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments, overlap
-from sofjax.likelihood import SensorModel, Sightings
 from sofjax.segment_map.lines import MapRules, SegmentMap, appear, believed, is_raised
+from sofjax.sightings import SensorModel, Sightings
 
 TILT_LEFT = 0.1  # share of the wobble's variance that remains when it has been solved for
 
