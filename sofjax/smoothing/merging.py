@@ -1,5 +1,8 @@
-"""Which lines describe one and the same: decided by how well both are known together."""
+"""Which lines describe one and the same: decided by how well all of them are known together."""
 
+from functools import partial
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,45 +12,66 @@ from sofjax.geometry.lines import PolarLine, alignment, polar_difference
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
 from sofjax.segment_map import appear
+from sofjax.smoothing.compatibility import GATE, compatible
 from sofjax.smoothing.lines import Lines
 from sofjax.smoothing.marginals import Marginals
 
-GATE = 3.0  # standard deviations between two descriptions of one line
 REACH, TURN = 0.25, 0.25  # metres, radians: beyond this what is likest may be a neighbour
 MODEL = (0.004, 0.01, 0.02)  # metres, radians, kappa: what no covariance knows of
 LEAST = 3  # sightings: of what is hardly seen all is possible
 GAP = 0.3  # metres between two pieces of one line
-PAIRS = 256  # compared in one call, however many there are
+PAIRS = 64  # told together
 
 
 def doubles(
     lines: Lines, marginals: Marginals, sightings: Int[Array, "K"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each line the one that was seen more and agrees with it best, within the gates.
+    """For each line another that was seen more and is the same, if there is one.
 
-    The two are compared where the line itself is, with the covariance of their difference: two
-    edges that were seen side by side are known well against each other and stay two; what was
-    seen again after a long way is known badly against what was seen first. What may as well be
-    one line as another that is not the same is left for later, when more is known.
+    Two are compared where the line itself is, with the covariance of their difference: two edges
+    that were seen side by side are known well against each other and stay two; what was seen again
+    after a long way is known badly against what was seen first, and all that was seen there tells
+    together which are one (`compatible`). What may as well be one line as another that is not the
+    same is left for later, when more is known.
 
     **Returns:** [K] the other's index, and whether there is one.
     """
     K = lines.valid.shape[0]
-    i, j = np.nonzero(np.asarray(_near(lines, sightings)))
-    into, least, doubtful = np.zeros(K, int), np.full(K, np.inf), np.zeros(K, bool)
-    if len(i):
-        room = np.zeros(-len(i) % PAIRS, int)
-        pairs = np.stack([np.append(i, room), np.append(j, room)], axis=1).reshape(-1, PAIRS, 2)
-        error = np.concatenate([_errors(lines, marginals, *some.T) for some in pairs])
-        error = dict(zip(zip(i.tolist(), j.tolist(), strict=True), error.tolist(), strict=False))
-        for (a, b), e in error.items():
-            if e < min(GATE**2, least[b]):
-                into[b], least[b] = a, e
-        same = lambda a, b: min(error.get((a, b), np.inf), error.get((b, a), np.inf)) < GATE**2
-        for (a, b), e in error.items():
-            if e < least[b] + GATE**2 and a != into[b] and not same(a, into[b]):
-                doubtful[b] = True
-    return into, np.isfinite(least) & ~doubtful
+    near, beside = map(np.asarray, _compared(lines, sightings))
+    i, j = np.nonzero(near)
+    since = np.asarray(lines.span[:, 0])
+    order = np.argsort(np.maximum(since[i], since[j]), kind="stable")  # one place after the other
+    i, j = i[order], j[order]
+    into, joins, error = np.zeros(K, int), np.zeros(K, bool), np.full((K, K), np.inf)
+    if not len(i):
+        return into, joins
+    of = [_differences(lines, marginals, *_filled(i[some], j[some])) for some in _parts(len(i))]
+    of = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(i)], *of)
+    error[i, j] = of.squared
+    two = beside & ~np.eye(K, dtype=bool) & ~(np.minimum(error, error.T) < GATE**2)
+
+    alone = of.squared < GATE**2
+    i, j, of = i[alone], j[alone], jax.tree.map(lambda a: a[alone], of)
+    for some in _parts(len(i)):
+        a, b, these = i[some], j[some], jax.tree.map(lambda v, s=some: v[s], of)
+        C = np.asarray(_covariance(marginals, *_filled(a, b)))[: len(a), :, : len(a)]
+        S = np.einsum("pia,paqb,qjb->piqj", these.by_lines, C, these.by_lines, optimize=True)
+        n = np.arange(len(a))
+        S[n, :, n] += these.own
+        sides = (a, b), (b, a)  # of two pairs with a line in common, is the rest two lines?
+        rivals = [(x[:, None] == y) & two[u[:, None], v] for x, u in sides for y, v in sides]
+        for k in compatible(these.value, S, np.any(rivals, axis=0)):
+            if not joins[b[k]] or error[a[k], b[k]] < error[into[b[k]], b[k]]:
+                into[b[k]], joins[b[k]] = a[k], True
+    return into, joins
+
+
+def _parts(size: int) -> list[slice]:
+    return [slice(k, min(k + PAIRS, size)) for k in range(0, size, PAIRS)]
+
+
+def _filled(*indices: np.ndarray) -> list[np.ndarray]:
+    return [np.append(a, np.zeros(PAIRS - len(a), int)) for a in indices]
 
 
 def _at(line, anchor, here):
@@ -68,63 +92,91 @@ def _middle(ends):
 
 
 @jax.jit
-def _near(lines: Lines, sightings: Int[Array, "K"]) -> Bool[Array, "K K"]:
-    """Pairs (i, j) of which j may be another description of i."""
+def _compared(
+    lines: Lines, sightings: Int[Array, "K"]
+) -> tuple[Bool[Array, "K K"], Bool[Array, "K K"]]:
+    """Pairs (i, j) of which j may be another description of i; and pairs that lie side by side."""
     K, ends = lines.valid.shape[0], lines.endpoints_world
 
     def of_line(j):
         here = _middle(ends[j])
         line, _ = jax.vmap(appear, in_axes=(0, 0, None))(lines.line, lines.anchor, here)
         d, _ = jax.vmap(_difference, in_axes=(0, None))(line, line[j])
-        gap = -jax.vmap(overlap, in_axes=(None, 0))(ends[j], ends)
+        shared = jax.vmap(overlap, in_axes=(None, 0))(ends[j], ends)
         more = (sightings > sightings[j]) | ((sightings == sightings[j]) & (jnp.arange(K) < j))
-        return (
+        both = lines.valid & lines.valid[j]
+        near = (
             (jnp.abs(d[:, 0]) < REACH)
             & (jnp.abs(d[:, 1]) < TURN)
-            & (gap < GAP)
+            & (shared > -GAP)
             & ((lines.raised == lines.raised[j]) | lines.vague | lines.vague[j])
-            & lines.valid
-            & lines.valid[j]
             & (sightings[j] >= LEAST)
             & more
         )
+        return near & both, (shared > 0) & both
 
-    return jax.lax.map(of_line, jnp.arange(K), batch_size=8).T
+    near, beside = jax.lax.map(of_line, jnp.arange(K), batch_size=8)
+    return near.T, beside & beside.T
+
+
+class Difference(eqx.Module):
+    """Of the two lines of a pair, (rho, theta, kappa)."""
+
+    value: Float[Array, "*pairs 3"]
+    by_lines: Float[Array, "*pairs 3 6"]  # how it depends on the two
+    own: Float[Array, "*pairs 3 3"]  # covariance of what is no error of the lines
+    squared: Float[Array, "*pairs"]  # in units of its covariance
 
 
 @jax.jit
-def _errors(
+def _differences(
     lines: Lines, marginals: Marginals, i: Int[Array, "pairs"], j: Int[Array, "pairs"]
-) -> Float[Array, "pairs"]:
-    """Squared difference of the two, in units of its covariance.
-
-    Where neither is known to stand above the floor, the larger of that and the one if both lay on
-    it: a height that is free explains too well why two edges of the floor should be one.
+) -> Difference:
+    """Where neither line is known to stand above the floor, the larger one of that and of what it
+    is if both lay on it: a height that is free explains too well why two edges should be one.
     """
     ends = lines.endpoints_world
-    model = jnp.diag(jnp.array(MODEL, lines.line.dtype) ** 2)
+    model = jnp.asarray(MODEL, lines.line.dtype) ** 2
     above = lines.raised & ~lines.vague
 
-    def difference(i, j, pair, covariance):
+    def difference(i, j, pair, by_pair, own, covariance):
         here = _middle(ends[j])
         anchor = lambda k: jax.tree.map(lambda a: a[k], lines.anchor)
         (a, A), (b, B) = _at(pair[:3], anchor(i), here), _at(pair[3:], anchor(j), here)
-        d, side = _difference(a, b)
+        value, side = _difference(a, b)
         D = jnp.concatenate([A, -side[:, None] * B], axis=1)
-        return d @ jnp.linalg.solve(D @ covariance @ D.T + model, d)
+        by_lines, own = D @ by_pair, jnp.diag(model) + D @ own @ D.T
+        error = by_lines @ covariance @ by_lines.T + own
+        return Difference(value, by_lines, own, value @ jnp.linalg.solve(error, value))
 
     def of_pair(i, j, own_i, own_j, both):
         pair = jnp.concatenate([lines.line[i], lines.line[j]])
         covariance = jnp.block([[own_i, both], [both.T, own_j]])
         kappa = covariance[:, 2::3]
-        gain = kappa @ jnp.linalg.inv(kappa[2::3] + MODEL[2] ** 2 * jnp.eye(2))
-        on_floor = pair + gain @ (1 - pair[2::3])
-        error = difference(i, j, pair, covariance)
-        error_on_floor = difference(i, j, on_floor, covariance - gain @ kappa.T)
-        return jnp.maximum(error, jnp.where(above[i] | above[j], 0, error_on_floor))
+        gain = kappa @ jnp.linalg.inv(kappa[2::3] + model[2] * jnp.eye(2))
+        by_rest = jnp.eye(6).at[:, 2::3].add(-gain)
+        free = difference(i, j, pair, jnp.eye(6), jnp.zeros((6, 6)), covariance)
+        told = model[2] * gain @ gain.T
+        on_floor = difference(i, j, pair + gain @ (1 - pair[2::3]), by_rest, told, covariance)
+        lie = ~(above[i] | above[j]) & (on_floor.squared > free.squared)
+        return jax.tree.map(partial(jnp.where, lie), on_floor, free)
 
     of = marginals.of_lines
     return jax.vmap(of_pair)(i, j, of(i, i), of(j, j), of(i, j))
+
+
+@jax.jit
+def _covariance(
+    marginals: Marginals, i: Int[Array, "pairs"], j: Int[Array, "pairs"]
+) -> Float[Array, "pairs 6 pairs 6"]:
+    """Of the two lines of each pair with those of all others."""
+    P = len(i)
+    line = jnp.stack([i, j], axis=1).ravel()
+    a, b = np.triu_indices(2 * P)
+    blocks = marginals.of_lines(line[a], line[b])
+    C = jnp.zeros((2 * P, 2 * P, 3, 3)).at[a, b].set(blocks)
+    C = C.at[b, a].set(jnp.swapaxes(blocks, 1, 2))
+    return jnp.swapaxes(C, 1, 2).reshape(P, 6, P, 6)
 
 
 def representatives(into: np.ndarray, joins: np.ndarray) -> np.ndarray:

@@ -1,0 +1,76 @@
+"""Which of many differences may all be zero at once, and which pairs of lines are therefore one.
+
+Joint compatibility (Neira and Tardos, IEEE T-RO 17(6), 2001): after a long way a drive may have
+drifted by as much as two edges are apart, as the foot and the top of a baseboard, and each fits the
+other alone. All that was seen there shares one drift, and fits together only where it is.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+GATE = 3.0  # standard deviations of a difference
+
+
+def compatible(
+    d: Float[np.ndarray, "pairs 3"],
+    S: Float[np.ndarray, "pairs 3 pairs 3"],
+    rivals: Bool[np.ndarray, "pairs pairs"],
+) -> list[int]:
+    """Pairs that are one, each the best borne out by all others that are left.
+
+    What a pair bears out of another is how much likelier its difference is by the first being one;
+    a pair is left undecided while one that excludes it is borne out as well.
+
+    **Arguments:**
+    - `d`: differences of the two of each pair.
+    - `S`: the covariance of all of them together; each has some error of its own.
+    - `rivals`: pairs of which not both can be one.
+
+    **Returns:** the pairs, in the order in which they were chosen.
+    """
+    chosen, index = [], np.arange(len(d))
+    while True:
+        possible = _squared(d, _own(S)) < GATE**2
+        index, d, S = index[possible], d[possible], S[possible][:, :, possible]
+        rivals = rivals[possible][:, possible]
+        if not len(index):
+            return chosen
+        support, excludes = _support(d, S, rivals)
+        other = np.where(excludes, support, -np.inf).max(axis=1)
+        clear = support > other + GATE**2
+        if not clear.any():
+            return chosen
+        k = np.where(clear, support, -np.inf).argmax()
+        chosen.append(int(index[k]))
+        keep = ~rivals[k]
+        keep[k] = False
+        gain = np.linalg.solve(S[k, :, k], S[k].reshape(3, -1))
+        d = d - (d[k] @ gain).reshape(d.shape)
+        S = S - (S[k].reshape(3, -1).T @ gain).reshape(S.shape)
+        index, d, S, rivals = index[keep], d[keep], S[keep][:, :, keep], rivals[keep][:, keep]
+
+
+def _own(S):
+    n = np.arange(len(S))
+    return S[n, :, n]
+
+
+def _squared(d, own):
+    return np.einsum("...i,...i->...", d, np.linalg.solve(own, d[..., None])[..., 0])
+
+
+def _support(d, S, rivals):
+    """Of each pair [h], twice the log-likelihood by which all are likelier if it is one, against
+    the gate; and the pairs [h, p] that it excludes.
+    """
+    own, itself = _own(S), np.eye(len(d), dtype=bool)
+    gain = np.einsum("hij,hjqk->hiqk", np.linalg.inv(own), S)
+    d_given = d - np.einsum("hi,hiqk->hqk", d, gain)
+    S_given = own - np.einsum("hiqj,hiqk->hqjk", S, gain)
+    S_given[itself] = own
+    e = np.where(itself, _squared(d, own), _squared(d_given, S_given))
+    told = np.linalg.slogdet(own)[1] - np.linalg.slogdet(S_given)[1]
+    excludes = rivals | (e > GATE**2)
+    value = np.where(excludes, 0, GATE**2 - e + told)
+    best = (value[:, :, None] >= value[:, None, :]) | ~rivals  # of rivals one counts
+    return np.where(best.all(axis=2), value, 0).sum(axis=1), excludes
