@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sofjax.calibration import distances
-from sofjax.calibration.pairs import start_at
+from sofjax.calibration import distances, start_at
 from sofjax.motion import MotionModel
 from sofjax.simulation import Detection, Odometer, Scene, observe, random_rig, take_ride
 

@@ -29,14 +29,15 @@ _HOME = {  # in reading order
     "Observation": "sofjax.observation",
     "Association": "sofjax.association",
     "MotionModel": "sofjax.motion",
-    "SensorModel": "sofjax.likelihood",
+    "SensorModel": "sofjax.sightings",
     "MapRules": "sofjax.segment_map",
     "FilterRules": "sofjax.slam",
     "SlamConfig": "sofjax.slam",
     "PRESETS": "sofjax.presets",
 }
-_MODULES = ("geometry", "association", "sof", "motion", "likelihood", "particles", "segment_map")
+_MODULES = ("geometry", "association", "sof", "motion", "sightings", "likelihood", "particles")
 _MODULES += (
+    "segment_map",
     "slam",
     "presets",
     "batch",

@@ -11,6 +11,7 @@ import sofjax
 
 PACKAGE = Path(__file__).parent.parent / "sofjax"
 FILES = sorted(PACKAGE.rglob("*.py"))
+EXPERIMENTS = PACKAGE.parent / "experiments"
 
 # each room imports from those before it; to add one is to say where it stands
 ROOMS = """
@@ -94,6 +95,15 @@ def test_the_core_opens_no_file_and_only_commands_print():
     assert {room_of(file) for file in FILES if "print" in calls(file)} <= {"cli"}
     exits = {file for file in FILES if {"exit", "quit"} & set(calls(file))}
     assert {room_of(file) for file in exits} <= {"cli", "__main__"}
+
+
+@pytest.mark.parametrize(
+    "file", sorted(EXPERIMENTS.rglob("*.py")), ids=lambda f: str(f.relative_to(EXPERIMENTS))
+)
+def test_experiments_use_what_the_rooms_offer(file):
+    for module in imports(file):
+        top, *inner = module.split(".")
+        assert top != "sofjax" or len(inner) <= 1 + (inner[:1] == ["io"]), module
 
 
 def modules_after(code):

@@ -27,11 +27,17 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 
 from sofjax import batch
-from sofjax.geometry.camera import Camera, Mount
-from sofjax.geometry.floor import floor_homography, floor_to_image
-from sofjax.geometry.lines import polar_difference, polar_through
-from sofjax.geometry.se2 import SE2
-from sofjax.geometry.segments import Segments, overlap
+from sofjax.geometry import (
+    SE2,
+    Camera,
+    Mount,
+    Segments,
+    floor_homography,
+    floor_to_image,
+    overlap,
+    polar_difference,
+    polar_through,
+)
 
 TRACKING, ANYWHERE = "track", "anywhere"
 TABLE = ((10_000, 30, 100, TRACKING), (10_000, 30, 400, TRACKING), (10_000, 30, 100, ANYWHERE))

@@ -20,10 +20,8 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 from mount_logs import EXACT, EXACT_MODEL, cramer_rao, make_log, roughly
 
-from sofjax.calibration import TURNS, DriveRules, FitRules, PairNoise, fit_drive
-from sofjax.calibration.tracks import TrackRules
-from sofjax.simulation import Odometer, make_world
-from sofjax.simulation.catalogue import around, furnish
+from sofjax.calibration import TURNS, DriveRules, FitRules, PairNoise, TrackRules, fit_drive
+from sofjax.simulation import Odometer, around, furnish, make_world
 
 NOISE, CAPACITY = 0.5, 1024
 MOUNT = ("height", "pitch", "roll")

@@ -23,10 +23,10 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 
 from sofjax.calibration import DriveRules, fit_drive
-from sofjax.calibration.pairs import U, start_at
-from sofjax.calibration.rounds import STARTS
 from sofjax.io.drive import read_drive
 from sofjax.vision import Frontend, observe_drive
+
+RULES = DriveRules()
 
 
 def main() -> None:
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--heights", type=int, default=6, help="from 0.7 to 1.3 times")
     parser.add_argument("--tilts", type=int, default=4, help="from -8 to 8 degrees more")
     parser.add_argument(
-        "--each", type=int, default=1, choices=range(1, len(STARTS) + 1),
+        "--each", type=int, default=1, choices=range(1, len(RULES.starts) + 1),
         help="searches, about each place; the command has all of them",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("runs/calibration"))
@@ -49,15 +49,17 @@ def main() -> None:
     double = lambda leaf: jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
     given = (drive.camera_file.camera, drive.camera_file.mount, log)
     camera, mount, log = jax.tree.map(lambda leaf: double(np.asarray(leaf)), given)
-    rules = dataclasses.replace(DriveRules(), starts=STARTS[: options.each])
+    rules = dataclasses.replace(RULES, starts=RULES.starts[: options.each])
     told = np.array([mount.height * options.scale, mount.pitch, mount.roll], float)
     unit = np.array([told[0] / 100, np.pi / 180, np.pi / 180])
     rows = []
     print("begun at               ends at                      off by                    seconds")
     for times in np.linspace(0.7, 1.3, options.heights):
         for more in np.radians(np.linspace(-8, 8, options.tilts)):
-            by = jnp.zeros(U).at[0].set(np.log(times)).at[1].set(more)
-            begin, begun = start_at(mount).moved(by).mount, time.process_time()
+            begin = dataclasses.replace(
+                mount, height=mount.height * times, pitch=mount.pitch + more
+            )
+            begun = time.process_time()
             found = fit_drive(camera, begin, log, rules)
             m, seconds = found.fit.mount, time.process_time() - begun
             end = np.array([m.height, m.pitch, m.roll])

@@ -21,8 +21,16 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 
 from sofjax.cli import main as sofjax
-from sofjax.simulation import World, make_world, random_rig, record, take_ride
-from sofjax.simulation.worlds import Areas, Lines, rectangle
+from sofjax.simulation import (
+    Areas,
+    Lines,
+    World,
+    make_world,
+    random_rig,
+    record,
+    rectangle,
+    take_ride,
+)
 
 KINDS = ("bars", "joints", "bare")
 WIDTH, MARGIN = 2.0, 15.0  # metres; the ends of the corridor are out of sight

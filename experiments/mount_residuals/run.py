@@ -20,9 +20,16 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 from mount_logs import EXACT_MODEL, cramer_rao, make_log, roughly
 
-from sofjax.calibration import PairNoise, expected, fit_mount
-from sofjax.calibration.pairs import distances, start_at
-from sofjax.calibration.tracks import TrackRules, follow, relate
+from sofjax.calibration import (
+    PairNoise,
+    TrackRules,
+    distances,
+    expected,
+    fit_mount,
+    follow,
+    relate,
+    start_at,
+)
 from sofjax.geometry import (
     line_through,
     polar,
@@ -31,7 +38,7 @@ from sofjax.geometry import (
     two_view_homography,
 )
 from sofjax.simulation import make_world
-from sofjax.smoothing.problem import robust
+from sofjax.smoothing import robust
 
 NOISE, CAPACITY = 0.5, 1024
 

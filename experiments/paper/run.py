@@ -17,7 +17,7 @@ from matplotlib.collections import LineCollection
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax.cli.main import main as sofjax
+from sofjax.cli import main as sofjax
 from sofjax.evaluation import align
 from sofjax.io.drive import read_drive
 from sofjax.io.map_file import read_map

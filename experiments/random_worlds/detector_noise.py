@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sofjax.geometry.camera import rotation_robot_camera
+from sofjax.geometry import rotation_robot_camera
 from sofjax.io.drive import Drive, read_drive
 from sofjax.vision import DETECTORS, Lens, read_image
 

@@ -5,10 +5,15 @@ from sofjax.calibration.fit import FitRules as FitRules
 from sofjax.calibration.fit import fit_mount as fit_mount
 from sofjax.calibration.pairs import TURNS as TURNS
 from sofjax.calibration.pairs import UNKNOWNS as UNKNOWNS
+from sofjax.calibration.pairs import Estimate as Estimate
 from sofjax.calibration.pairs import PairNoise as PairNoise
 from sofjax.calibration.pairs import Pairs as Pairs
 from sofjax.calibration.pairs import distances as distances
 from sofjax.calibration.pairs import expected as expected
+from sofjax.calibration.pairs import start_at as start_at
 from sofjax.calibration.rounds import DriveFit as DriveFit
 from sofjax.calibration.rounds import DriveRules as DriveRules
 from sofjax.calibration.rounds import fit_drive as fit_drive
+from sofjax.calibration.tracks import TrackRules as TrackRules
+from sofjax.calibration.tracks import follow as follow
+from sofjax.calibration.tracks import relate as relate

@@ -26,4 +26,7 @@ from sofjax.simulation.robots import Driver as Driver
 from sofjax.simulation.robots import Odometer as Odometer
 from sofjax.simulation.segments import Scene as Scene
 from sofjax.simulation.segments import observe as observe
+from sofjax.simulation.worlds import Areas as Areas
+from sofjax.simulation.worlds import Lines as Lines
 from sofjax.simulation.worlds import World as World
+from sofjax.simulation.worlds import rectangle as rectangle

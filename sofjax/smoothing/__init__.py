@@ -16,6 +16,7 @@ from sofjax.smoothing.problem import Priors as Priors
 from sofjax.smoothing.problem import Problem as Problem
 from sofjax.smoothing.problem import Unknowns as Unknowns
 from sofjax.smoothing.problem import residuals as residuals
+from sofjax.smoothing.problem import robust as robust
 from sofjax.smoothing.rounds import Path as Path
 from sofjax.smoothing.rounds import Smoothed as Smoothed
 from sofjax.smoothing.rounds import SmoothingRules as SmoothingRules
