@@ -135,6 +135,7 @@ def draw(path: Path, table: dict) -> None:
             axes.plot(x, value("error"), "o" + line, color=colour, ms=4, label=what)
             axes.plot(x, value("bound"), "_" if words else "--", color=colour, ms=16, lw=1)
         axes.set_yscale("log")
+        common.plain_ticks(axes.yaxis)
         if words:
             axes.set_xticks(x, [f"{k}\n{cells[k]['answers']}/{cells[k]['logs']}" for k in keys])
             axes.set_xlim(-0.5, len(keys) - 0.5)
