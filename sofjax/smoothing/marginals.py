@@ -5,6 +5,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, Int
 
@@ -26,51 +27,41 @@ class Marginals(eqx.Module):
         at = jnp.searchsorted(d.generations[-1].own[0], d.size - SHARED)  # the root's last
         return jax.lax.dynamic_slice(self.within[-1][0], (at, at), (SHARED, SHARED))
 
-    def of_lines(self, i: Int[Array, "pairs"], j: Int[Array, "pairs"]) -> Float[Array, "pairs 3 3"]:
-        """Between lines i and j.
+    def of_lines(self, lines: Int[Array | np.ndarray, "L"]) -> Float[Array, "L 3 L 3"]:
+        """Of some lines together.
 
-        Each is followed up the tree, as a combination of what ever higher nodes border on, to the
-        lowest node above both.
+        Each is followed up the tree, as a combination of what ever higher nodes border on; two are
+        known together by the lowest node above both.
         """
         d = self.factors.dissection
         leaf, place = d.line
         start = jnp.zeros((LINE, self.within[0].shape[1]))
         itself = lambda k: start.at[:, place[k] + jnp.arange(LINE)].set(jnp.eye(LINE))
+        rows, nodes = jax.vmap(itself)(lines), leaf[lines]
+        found = jnp.zeros((len(lines), LINE, len(lines), LINE))
+        met = jnp.zeros((len(lines), len(lines)), bool)
+        for height, within in enumerate(self.within):
+            if height:
+                rows = jax.lax.map(partial(self._lifted, height - 1), (rows, nodes))
+                nodes = nodes // BRANCH
+            meet = (nodes[:, None] == nodes) & ~met
+            known = jax.lax.map(
+                lambda each, within=within: each[0] @ within[each[1]], (rows, nodes)
+            )
+            between = jnp.einsum("akw,blw->akbl", known, rows)
+            found = jnp.where(meet[:, None, :, None], between, found)
+            met = met | meet
+        return found
 
-        def of_pair(pair):
-            rows, nodes = [itself(k) for k in pair], [leaf[k] for k in pair]
-            found, met = jnp.zeros((LINE, LINE)), jnp.array(False)
-            for height in range(len(d.generations)):
-                meet = (nodes[0] == nodes[1]) & ~met
-                between = partial(_between, self.within[height])
-                found = jax.lax.cond(meet, between, lambda *same: same[-1], *rows, nodes[0], found)
-                met = met | meet
-                if height + 1 < len(d.generations):
-                    rows = [
-                        self._lifted(height, row, k, met)
-                        for row, k in zip(rows, nodes, strict=True)
-                    ]
-                    nodes = [k // BRANCH for k in nodes]
-            return found
-
-        return jax.lax.map(of_pair, (i, j))
-
-    def _lifted(self, height, row, node, useless):
-        """A combination of what a node knows as one of what its parent knows, if that is of use."""
+    def _lifted(self, height, each):
+        """A combination of what a node knows as one of what its parent knows."""
+        row, node = each
         above = self.factors.dissection.generations[height].above
         factor, ties = self.factors.factor[height], self.factors.ties[height]
-        none, a = jnp.zeros((LINE, self.within[height + 1].shape[1])), ties.shape[1]
-
-        def lifted(row, k):
-            follows = solve_triangular(factor[k], row[:, :a].T, lower=True).T @ ties[k]
-            border = row[:, a:] - follows
-            return none.at[:, above[k]].add(border, mode="drop")
-
-        return jax.lax.cond(useless, lambda *_: none, lifted, row, node)
-
-
-def _between(within, first, second, node, _):
-    return first @ within[node] @ second.T
+        a = ties.shape[1]
+        follows = solve_triangular(factor[node], row[:, :a].T, lower=True).T @ ties[node]
+        none = jnp.zeros((LINE, self.within[height + 1].shape[1]))
+        return none.at[:, above[node]].add(row[:, a:] - follows, mode="drop")
 
 
 def marginals(factors: Factors) -> Marginals:

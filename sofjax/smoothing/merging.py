@@ -149,9 +149,8 @@ def _differences(
         error = by_lines @ covariance @ by_lines.T + own
         return Difference(value, by_lines, own, value @ jnp.linalg.solve(error, value))
 
-    def of_pair(i, j, own_i, own_j, both):
+    def of_pair(i, j, covariance):
         pair = jnp.concatenate([lines.line[i], lines.line[j]])
-        covariance = jnp.block([[own_i, both], [both.T, own_j]])
         kappa = covariance[:, 2::3]
         gain = kappa @ jnp.linalg.inv(kappa[2::3] + model[2] * jnp.eye(2))
         by_rest = jnp.eye(6).at[:, 2::3].add(-gain)
@@ -161,8 +160,8 @@ def _differences(
         lie = ~(above[i] | above[j]) & (on_floor.squared > free.squared)
         return jax.tree.map(partial(jnp.where, lie), on_floor, free)
 
-    of = marginals.of_lines
-    return jax.vmap(of_pair)(i, j, of(i, i), of(j, j), of(i, j))
+    n = jnp.arange(len(i))
+    return jax.vmap(of_pair)(i, j, _covariance(marginals, i, j)[n, :, n])
 
 
 @jax.jit
@@ -171,12 +170,7 @@ def _covariance(
 ) -> Float[Array, "pairs 6 pairs 6"]:
     """Of the two lines of each pair with those of all others."""
     P = len(i)
-    line = jnp.stack([i, j], axis=1).ravel()
-    a, b = np.triu_indices(2 * P)
-    blocks = marginals.of_lines(line[a], line[b])
-    C = jnp.zeros((2 * P, 2 * P, 3, 3)).at[a, b].set(blocks)
-    C = C.at[b, a].set(jnp.swapaxes(blocks, 1, 2))
-    return jnp.swapaxes(C, 1, 2).reshape(P, 6, P, 6)
+    return marginals.of_lines(jnp.stack([i, j], axis=1).ravel()).reshape(P, 6, P, 6)
 
 
 def representatives(into: np.ndarray, joins: np.ndarray) -> np.ndarray:
