@@ -45,7 +45,9 @@ def doubles(
     into, joins, error = np.zeros(K, int), np.zeros(K, bool), np.full((K, K), np.inf)
     if not len(i):
         return into, joins
-    of = [_differences(lines, marginals, *_filled(i[some], j[some])) for some in _parts(len(i))]
+    parts = [_filled(i[some], j[some]) for some in _parts(len(i))]
+    own = np.arange(PAIRS)
+    of = [_differences(lines, *part, _covariance(marginals, *part)[own, :, own]) for part in parts]
     of = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(i)], *of)
     error[i, j] = of.squared
     two = beside & ~np.eye(K, dtype=bool) & ~(np.minimum(error, error.T) < GATE**2)
@@ -130,7 +132,10 @@ class Difference(eqx.Module):
 
 @jax.jit
 def _differences(
-    lines: Lines, marginals: Marginals, i: Int[Array, "pairs"], j: Int[Array, "pairs"]
+    lines: Lines,
+    i: Int[Array | np.ndarray, "pairs"],
+    j: Int[Array | np.ndarray, "pairs"],
+    covariance: Float[Array, "pairs 6 6"],
 ) -> Difference:
     """Where neither line is known to stand above the floor, the larger one of that and of what it
     is if both lay on it: a height that is free explains too well why two edges should be one.
@@ -160,13 +165,12 @@ def _differences(
         lie = ~(above[i] | above[j]) & (on_floor.squared > free.squared)
         return jax.tree.map(partial(jnp.where, lie), on_floor, free)
 
-    n = jnp.arange(len(i))
-    return jax.vmap(of_pair)(i, j, _covariance(marginals, i, j)[n, :, n])
+    return jax.vmap(of_pair)(i, j, covariance)
 
 
 @jax.jit
 def _covariance(
-    marginals: Marginals, i: Int[Array, "pairs"], j: Int[Array, "pairs"]
+    marginals: Marginals, i: Int[Array | np.ndarray, "pairs"], j: Int[Array | np.ndarray, "pairs"]
 ) -> Float[Array, "pairs 6 pairs 6"]:
     """Of the two lines of each pair with those of all others."""
     P = len(i)
