@@ -60,8 +60,8 @@ def _squared(d, own):
 
 
 def _support(d, S, rivals):
-    """Of each pair [h], twice the log-likelihood by which all are likelier if it is one, against
-    the gate; and the pairs [h, p] that it excludes.
+    """Of each pair [h] twice the log-likelihood that it adds if it is one: its own and that of all
+    that it bears out, where a pair at the gate adds nothing; and the pairs [h, p] it excludes.
     """
     own, itself = _own(S), np.eye(len(d), dtype=bool)
     gain = np.einsum("hij,hjqk->hiqk", np.linalg.inv(own), S)

@@ -1,4 +1,4 @@
-"""How sure a solution is: covariances of its poses and lines, and of two lines with each other."""
+"""How sure a solution is: covariances of its poses, and of its lines with each other."""
 
 from functools import partial
 
