@@ -188,7 +188,7 @@ def test_what_may_as_well_be_one_as_another_is_left_for_later():
 
 @pytest.mark.parametrize(("y", "joins"), [(-0.2, [False] * 3), (0.19, [False, True, True])])
 def test_two_that_are_known_to_be_two_are_not_both_made_one_with_a_third(y, joins):
-    """Each may be the first line, by errors of its own, and 40 cm apart they are not one another."""
+    """Each may be the first line, by errors of its own; 40 cm apart they are not one another."""
     lines = lines_along_x([0.0, 0.2, y], [(1, 2)] * 3)
     sigma = jnp.diag(jnp.array([0.1, 0.01, 1e-6]))
     joint = jnp.einsum("ab,kl->kalb", sigma @ sigma, jnp.diag(jnp.array([0.01, 1.0, 1.0])))
