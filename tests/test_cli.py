@@ -147,6 +147,9 @@ def test_settings_come_from_the_preset_the_file_and_the_options_in_this_order(dr
     assert gathered("--set", "preset=paper").loop == "none"
     assert gathered("--set", "preset=paper", "--loop", "smooth").loop == "smooth"
     assert gathered("--set", "preset=paper").frontend.detector == "hough"
+    recall = lambda *args: gathered(*args).slam.segment_map.recall
+    assert recall("--loop", "paper") == 150 < recall("--loop", "none")
+    assert recall("--loop", "paper", "--set", "segment_map.recall=99") == 99
     file = tmp_path / "c.toml"
     file.write_text('preset = "paper"\nseed = 4\n[frontend]\ncapacity = 9\n')
     from_file = gathered("--config", file)

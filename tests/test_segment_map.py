@@ -675,6 +675,15 @@ def test_lines_beyond_those_nearby_only_age():
     assert offset(after, 1) == pytest.approx(2.1)
 
 
+def test_what_was_seen_too_long_ago_is_not_looked_for():
+    m = seen(empty_map(GAMMA), across(1.0), across(2.0))
+    m = seen(m, across(1.0), slots=[0])
+    for recall, slots in ((0, [0]), (1, [0, 1])):
+        rules = dataclasses.replace(GAMMA, recall=recall)
+        near, hidden = nearby(rules, m, pose(), jnp.array(6.0))
+        assert [int(k) for k in near if k < m.updates.shape[0]] == slots and hidden == 0
+
+
 def test_what_is_in_view_worked_by_hand(camera):
     level = Mount.create(height=1.0)  # the image ends 270 / 120 m ahead
     middles = [(3, 0), (2.0, 0), (4, 1.5), (4, 3.0), (-3, 0), (5.5, 0)]

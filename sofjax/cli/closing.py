@@ -18,9 +18,11 @@ from sofjax.cli.tally import Closed, Tally
 from sofjax.evaluation import align
 from sofjax.io.drive import Drive
 from sofjax.io.trajectory import Trajectory, write_trajectory
+from sofjax.loop_closure import ClosingRules
 from sofjax.slam import SlamState
 
-TOLD = 0.4  # share of lines that must fit where a user says that the drive ends as a loop
+# where a user says that the drive ends as a loop: the share of lines that must fit, and the lead
+TOLD = ClosingRules(share=0.4, margin=6.0)
 SPREAD = 0.5  # metres about its middle that a path needs to show a direction
 
 
@@ -113,7 +115,7 @@ def _by_the_paper(drive, settings, tally, log, path, state) -> Closed | None:
     final = jax.device_get(eqx.filter_jit(slam.final_map)(settings.slam, mount, state.segment_map))
     known = loop_closure.driven(path, mount, state.segment_map, final)
     last = np.array([len(tally.stamps) - 1])
-    asked = loop_closure.revisits(loop_closure.ClosingRules(share=TOLD), known, last)
+    asked = loop_closure.revisits(TOLD, known, last)
     T, endpoints = path.T_world_robot, final.endpoints_world
     for revisit in asked:
         if revisit.closing.accepted:

@@ -14,6 +14,8 @@ FRONTENDS = {"paper": FrontendSettings(detector="hough")}  # of a preset; the de
 
 CLOSINGS = {"paper": "none"}  # likewise; the paper closes by hand, where it knows of a loop
 
+RECALL = 150  # images: the paper's closing is of a filter that does not find its start by itself
+
 CHOICES = {
     "loop": LOOPS,
     "frontend.detector": tuple(DETECTORS),
@@ -58,6 +60,9 @@ def gather(args: argparse.Namespace) -> RunSettings:
     for option, (name, value) in named.items():
         if value is not None:
             settings = _changed(settings, {name: value}, option)
+    rules = settings.slam.segment_map
+    if settings.loop == "paper" and rules.recall == type(rules)().recall:
+        settings = with_settings(settings, {"segment_map.recall": RECALL}, "--loop")
     return settings
 
 

@@ -35,6 +35,7 @@ class MapRules(eqx.Module):
     kappa_known: float = 0.07  # standard deviation below which a line may be one of the final map
     rho_drift: float = 0.002  # metres: no map line is known better than ...
     theta_drift: float = 0.002  # ... this, radians
+    recall: int = 1_000_000  # steps unseen after which a line is not looked for any more
     forget: int = 50  # steps unseen after which a line of few sightings is dropped
     min_updates: int = 5  # sightings that make a line one of the final map, ...
     min_share: float = 0.25  # ... and their share of the images in which it should have been seen
@@ -135,7 +136,8 @@ def nearby(
     """The slots of the lines nearest to a foot: the one pass over the whole map in a step.
 
     All lines if there are no more than L; else those within a radius of which there are so many,
-    which leaves nothing out that can be seen as long as it is not less than `reach`.
+    which leaves nothing out that can be seen as long as it is not less than `reach`. Those unseen
+    for longer than `rules.recall` are passed over.
 
     **Arguments:**
     - `reach`: metres that the farthest point seen, and what may match it, is away.
@@ -151,7 +153,8 @@ def nearby(
     share = jnp.clip(-(x * u + y * v) / jnp.maximum(u * u + v * v, 1e-12), 0, 1)
     # a raised line is seen magnified about the foot
     distance2 = ((x + share * u) ** 2 + (y + share * v) ** 2) * segment_map.line[:, 2] ** 2
-    distance2 = jnp.where(segment_map.valid, distance2, jnp.inf)
+    there = segment_map.valid & (segment_map.unseen <= rules.recall)
+    distance2 = jnp.where(there, distance2, jnp.inf)
     radii = jnp.append(reach * jnp.arange(1, RUNGS + 1, dtype=float) / RUNGS, jnp.inf)
     counts = jnp.sum(distance2 < radii[:, None] ** 2, axis=1)
     radius = jnp.max(jnp.where(counts <= L, radii, 0))
