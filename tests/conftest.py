@@ -1,6 +1,8 @@
 """Strict JAX for every test: no silent promotion of types, and float64 where a test asks for it."""
 
 import functools
+import os
+import tempfile
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,17 @@ import pytest
 from sofjax.geometry import Camera, Mount
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+CACHE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def pytest_configure(config):
+    """All workers, and all that they start, compile a program once and read it after that."""
+    if CACHE not in os.environ:
+        folder = tempfile.TemporaryDirectory(prefix="sofjax-tests-")
+        config.add_cleanup(folder.cleanup)
+        os.environ[CACHE] = folder.name
+        jax.config.update(CACHE.lower(), folder.name)
 
 
 @pytest.fixture

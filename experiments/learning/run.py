@@ -162,7 +162,7 @@ def main() -> None:
     images, count, seeds, steps, N, many = (50, 6, 2, 15, 64, 24)
     starts = STARTS
     if args.quick:
-        images, count, seeds, steps, N, many = (15, 2, 1, 2, 16, 2)
+        images, count, seeds, steps, N, many = (15, 2, 2, 2, 16, 2)
         starts = {"noise × 4": 4.0}
     drives = [
         common.random_drive("random", seed, images)

@@ -140,7 +140,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     settings = ["--set", *args.set] if args.set else []
-    worlds, few = (2, ["--images", "60"]) if args.quick else (args.worlds, [])
+    worlds, few = (1, ["--images", "60"]) if args.quick else (args.worlds, [])
     results, known = args.out / ("quick.csv" if args.quick else "results.csv"), set()
     args.out.mkdir(parents=True, exist_ok=True)
     if results.exists():
