@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 GATE = 3.0  # standard deviations of a difference
+WIDE = 4.0  # of one that many others bear out: what they share may have drifted far
 
 
 def compatible(
@@ -30,13 +31,16 @@ def compatible(
     """
     chosen, index = [], np.arange(len(d))
     while True:
-        possible = _squared(d, _own(S)) < GATE**2
-        index, d, S = index[possible], d[possible], S[possible][:, :, possible]
+        e = _squared(d, _own(S))
+        possible = e < WIDE**2
+        index, d, S, e = index[possible], d[possible], S[possible][:, :, possible], e[possible]
         rivals = rivals[possible][:, possible]
         if not len(index):
             return chosen
         support, excludes = _support(d, S, rivals)
+        none = _of_rivals(np.maximum(GATE**2 - e, 0)[None], rivals)  # no pair more is one
         other = np.where(excludes, support, -np.inf).max(axis=1)
+        other = np.where(e < GATE**2, other, np.maximum(other, none))
         clear = support > other + GATE**2
         if not clear.any():
             return chosen
@@ -72,5 +76,10 @@ def _support(d, S, rivals):
     told = np.linalg.slogdet(own)[1] - np.linalg.slogdet(S_given)[1]
     excludes = rivals | (e > GATE**2)
     value = np.where(excludes, 0, GATE**2 - e + told)
-    best = (value[:, :, None] >= value[:, None, :]) | ~rivals  # of rivals one counts
-    return np.where(best.all(axis=2), value, 0).sum(axis=1), excludes
+    return _of_rivals(value, rivals), excludes
+
+
+def _of_rivals(value, rivals):
+    """The sum of the values [h, pairs], of rivals the best one alone."""
+    best = (value[:, :, None] >= value[:, None, :]) | ~rivals
+    return np.where(best.all(axis=2), value, 0).sum(axis=1)

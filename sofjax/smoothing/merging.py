@@ -12,11 +12,11 @@ from sofjax.geometry.lines import PolarLine, alignment, polar_difference
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
 from sofjax.segment_map import appear
-from sofjax.smoothing.compatibility import GATE, compatible
+from sofjax.smoothing.compatibility import GATE, WIDE, compatible
 from sofjax.smoothing.lines import Lines
 from sofjax.smoothing.marginals import Marginals
 
-REACH, TURN = 0.25, 0.25  # metres, radians: beyond this what is likest may be a neighbour
+REACH, TURN = 0.4, 0.25  # metres, radians: beyond this what is likest may be a neighbour
 MODEL = (0.004, 0.01, 0.02)  # metres, radians, kappa: what no covariance knows of
 LEAST = 3  # sightings: of what is hardly seen all is possible
 GAP = 0.3  # metres between two pieces of one line
@@ -52,7 +52,7 @@ def doubles(
     error[i, j] = of.squared
     two = beside & ~np.eye(K, dtype=bool) & ~(np.minimum(error, error.T) < GATE**2)
 
-    alone = of.squared < GATE**2
+    alone = of.squared < WIDE**2
     i, j, of = i[alone], j[alone], jax.tree.map(lambda a: a[alone], of)
     for some in _parts(len(i)):
         a, b, these = i[some], j[some], jax.tree.map(lambda v, s=some: v[s], of)
