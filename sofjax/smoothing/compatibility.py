@@ -39,9 +39,9 @@ def compatible(
             return chosen
         support, excludes = _support(d, S, rivals)
         none = _of_rivals(np.maximum(GATE**2 - e, 0)[None], rivals)  # no pair more is one
-        other = np.where(excludes, support, -np.inf).max(axis=1)
-        other = np.where(e < GATE**2, other, np.maximum(other, none))
-        clear = support > other + GATE**2
+        borne = (e < GATE**2) | (support > none + GATE**2)
+        other = np.where(excludes & borne, support, -np.inf).max(axis=1)
+        clear = borne & (support > other + GATE**2)
         if not clear.any():
             return chosen
         k = np.where(clear, support, -np.inf).argmax()
