@@ -44,6 +44,25 @@ def test_as_well_one_place_as_another_is_left_undecided(across, chosen):
     assert set(compatible(d, S, among(len(across)))) == chosen
 
 
+def test_a_drift_at_the_gate_takes_along_what_is_beyond_it():
+    d, S = drifted([0.148, 0.153, 0.155, 0.16, 0.0])  # the last fits best alone
+    assert set(compatible(d, S, among(5))) == {0, 1, 2, 3}
+    for one in range(1, 4):
+        assert compatible(d[[one]], S[[one]][:, :, [one]], among(1)) == []
+
+
+def test_where_all_is_beyond_the_gate_nothing_is_chosen_and_nothing_against_it():
+    d, S = drifted([0.17, 0.169, 0.172, 0.17, 0.0])
+    assert compatible(d, S, among(5)) == []
+    assert compatible(d[4:], S[4:, :, 4:], among(1)) == [0]
+
+
+def test_what_is_beyond_the_gate_and_alone_excludes_nothing():
+    d, S = drifted([0.0, 0.17], drift_sigma=0.05)
+    S[0, :, 1], S[1, :, 0] = 0, 0
+    assert compatible(d, S, among(2, (0, 1))) == [0]
+
+
 def test_of_two_that_exclude_each_other_the_better_by_far_is_one():
     d, S = drifted([0.0, 0.0, 0.002, 0.029])
     assert set(compatible(d, S, among(4, (2, 3)))) == {0, 1, 2}  # the last is 4 sigma off

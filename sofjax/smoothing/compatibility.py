@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 GATE = 3.0  # standard deviations of a difference
-WIDE = 4.0  # of one that many others bear out: what they share may have drifted far
+WIDE = 4.0  # of one that may be within the gate once others are one: all share a drift
 
 
 def compatible(
@@ -20,7 +20,8 @@ def compatible(
     """Pairs that are one, each the best borne out by all others that are left.
 
     What a pair bears out of another is how much likelier its difference is by the first being one;
-    a pair is left undecided while one that excludes it is borne out as well.
+    a pair is left undecided while one that excludes it is borne out as well. One beyond the gate
+    is not chosen, but may be borne out and bears out others: once these are one it may be within.
 
     **Arguments:**
     - `d`: differences of the two of each pair.
@@ -38,10 +39,11 @@ def compatible(
         if not len(index):
             return chosen
         support, excludes = _support(d, S, rivals)
-        none = _of_rivals(np.maximum(GATE**2 - e, 0)[None], rivals)  # no pair more is one
-        borne = (e < GATE**2) | (support > none + GATE**2)
+        none = _of_rivals(np.maximum(GATE**2 - e, 0)[None], rivals)  # if no more are one
+        within = e < GATE**2
+        borne = within | (support > none + GATE**2)
         other = np.where(excludes & borne, support, -np.inf).max(axis=1)
-        clear = borne & (support > other + GATE**2)
+        clear = within & (support > other + GATE**2)
         if not clear.any():
             return chosen
         k = np.where(clear, support, -np.inf).argmax()
