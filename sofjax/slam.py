@@ -184,8 +184,9 @@ def step(
     candidates, at, nearest = propose(rules, sensor, lines, sightings, T_world_foot)
     feet = T_world_foot.inverse() @ (T_world_robot @ mount.T_robot_foot)
     if config.filter.soft:
-        many = in_view(rules, camera, mount, lines, predicted).sum()
-        of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, many)
+        unused = observation.segments_image.valid & ~sightings.valid
+        many = in_view(rules, camera, mount, lines, predicted).sum(), unused.sum()
+        of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, *many)
         log_likelihood = jax.vmap(of_soft)(feet, used)
     else:
         found = compare(sensor, sightings, candidates, feet, used.T)
@@ -298,14 +299,19 @@ def _gate(config: SlamConfig, found: SofExtraction) -> Array:
     )
 
 
-def _log_density(config, camera, sightings, candidates, T_predicted_foot, floor, lines):
-    """Of one pose, by the probabilities [M] of lying on the floor and the lines in view."""
+def _log_density(config, camera, sightings, candidates, T_predicted_foot, floor, lines, unused):
+    """Of one pose, by the probabilities [M] of lying on the floor and the lines in view.
+
+    What is not used, as it is too short to have a direction, counts as anywhere in the image: how
+    many those are depends on the settings, and a density is one of all that was observed.
+    """
     elsewhere = -jnp.log(float(camera.width * camera.height))  # its ends anywhere in the image
     lines = jnp.maximum(lines, 1).astype(float)
     known = KNOWN * floor
-    return log_density(
+    of_used = log_density(
         config.sensor, sightings, candidates, T_predicted_foot, known, lines, elsewhere
     )
+    return of_used + unused.astype(float) * elsewhere
 
 
 class FinalMap(eqx.Module):

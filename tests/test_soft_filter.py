@@ -82,6 +82,18 @@ def test_the_gradient_of_a_drive_s_evidence_is_that_of_differences():
     assert (np.abs(gradient) > 1e-4).all()
 
 
+def test_what_is_too_vague_to_be_used_counts_as_anywhere_in_the_image():
+    """Else a sigma that leaves all segments out would be the likeliest."""
+    program, at, observations = differentiated()
+    (usual, _), _ = program(at, observations)
+    vague = at.at[VARIABLES.index(("sensor", "pixel_sigma"))].set(100.0)
+    (value, info), _ = program(vague, observations)
+    assert info.below_horizon.sum() == 0 < info.detected.sum()
+    pixels = test_slam.CAMERA.width * test_slam.CAMERA.height
+    assert value == pytest.approx(-np.log(pixels) * int(info.detected.sum()), rel=1e-6)
+    assert usual > value
+
+
 def test_the_gradient_keeps_a_state_a_step_and_works_the_rest_out_again():
     program, *_ = differentiated()
     state = jax.eval_shape(
