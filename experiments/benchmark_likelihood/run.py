@@ -269,7 +269,7 @@ def draw(problems: dict, path: Path) -> None:
     axes.set_yticks(np.arange(len(forms)) + 0.3, forms)
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel="CPU milliseconds of a call")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1, 1), ncols=len(problems))
     plot.savefig(path, dpi=110)
 
 
