@@ -302,8 +302,8 @@ def _gate(config: SlamConfig, found: SofExtraction) -> Array:
 def _log_density(config, camera, sightings, candidates, T_predicted_foot, floor, lines, unused):
     """Of one pose, by the probabilities [M] of lying on the floor and the lines in view.
 
-    What is not used, as it is too short to have a direction, counts as anywhere in the image: how
-    many those are depends on the settings, and a density is one of all that was observed.
+    What is not used (above the horizon, too far, of too vague a direction) counts as anywhere in
+    the image: how many those are depends on sigmas and mount; a density is of all that was seen.
     """
     elsewhere = -jnp.log(float(camera.width * camera.height))  # its ends anywhere in the image
     lines = jnp.maximum(lines, 1).astype(float)

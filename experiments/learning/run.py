@@ -5,7 +5,7 @@
 On some drives of random worlds and robots, seen as segments, the evidence of the soft filter is
 maximised by BFGS over the logarithms of the sensor's and the motion's noise, alpha, beta and
 Theta: from the defaults, from noise that a user has set 4 times too large or too small, and from
-the defaults for robots that shake and slip 4 times as much as others and see half as well. On
+the defaults for robots whose mount and odometer are 4 times as noisy, and their segments twice. On
 drives kept back the evidence and the error of the trajectory are compared before and after, for
 the soft filter and for the usual one. At the defaults the gradient is set against differences of
 the evidence, averaged over random numbers. Writes learning.json and learning.png.
@@ -38,7 +38,7 @@ GATE = (("association", "alpha"), ("association", "beta"), ("association", "gate
 NAMES = NOISE + GATE
 REACH = 1.5  # of a logarithm: a prior about the start, for what the drives tell nothing of
 STEP = 0.1  # of a logarithm, of the differences
-SHAKY = 4.0
+SHAKY = 4.0  # times the noise of mount and odometer
 
 
 def shaky_drive(name: str, seed: int, images: int) -> common.Drive:

@@ -18,11 +18,10 @@ from sofjax.cli.tally import Closed, Tally
 from sofjax.evaluation import align
 from sofjax.io.drive import Drive
 from sofjax.io.trajectory import Trajectory, write_trajectory
-from sofjax.loop_closure import ClosingRules
 from sofjax.slam import SlamState
 
 # where a user says that the drive ends as a loop: the share of lines that must fit, and the lead
-TOLD = ClosingRules(share=0.4, margin=6.0)
+TOLD = loop_closure.ClosingRules(share=0.4, margin=6.0)
 SPREAD = 0.5  # metres about its middle that a path needs to show a direction
 
 

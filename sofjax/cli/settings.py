@@ -7,6 +7,7 @@ from sofjax import presets
 from sofjax.cli.run import LOOPS
 from sofjax.io.errors import InputError, nearest
 from sofjax.io.settings import INLINE, read_toml, to_dict, with_settings
+from sofjax.segment_map import MapRules
 from sofjax.slam import SlamConfig
 from sofjax.vision import DETECTORS, FrontendSettings
 
@@ -45,7 +46,8 @@ class RunSettings:
 def gather(args: argparse.Namespace) -> RunSettings:
     """The default, changed by the file, by `--set`, and by the options of their own, in this order.
 
-    In the file as in `--set`, a `preset` comes first, wherever it stands.
+    In the file as in `--set`, a `preset` comes first, wherever it stands. The paper's closing
+    brings its own `segment_map.recall`, unless one was given.
     """
     settings = _preset("default", "")
     if args.config is not None:
@@ -60,8 +62,8 @@ def gather(args: argparse.Namespace) -> RunSettings:
     for option, (name, value) in named.items():
         if value is not None:
             settings = _changed(settings, {name: value}, option)
-    rules = settings.slam.segment_map
-    if settings.loop == "paper" and rules.recall == type(rules)().recall:
+    untouched = settings.slam.segment_map.recall == MapRules().recall
+    if settings.loop == "paper" and untouched:
         settings = with_settings(settings, {"segment_map.recall": RECALL}, "--loop")
     return settings
 
