@@ -20,7 +20,7 @@ REACH, TURN = 0.4, 0.25  # metres, radians: beyond this what is likest may be a 
 MODEL = (0.004, 0.01, 0.02)  # metres, radians, kappa: what no covariance knows of
 LEAST = 3  # sightings: of what is hardly seen all is possible
 GAP = 0.3  # metres between two pieces of one line
-PAIRS = 64  # told together
+PAIRS = 128  # told together
 
 
 def doubles(
