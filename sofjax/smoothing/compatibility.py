@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 GATE = 3.0  # standard deviations of a difference
-WIDE = 4.0  # of one that may be within the gate once others are one: all share a drift
+WIDE = 4.0  # beyond this it is excluded; once others are one it may be within the gate
 
 
 def compatible(
@@ -67,7 +67,8 @@ def _squared(d, own):
 
 def _support(d, S, rivals):
     """Of each pair [h] twice the log-likelihood that it adds if it is one: its own and that of all
-    that it bears out, where a pair at the gate adds nothing; and the pairs [h, p] it excludes.
+    that it bears out, where a pair at the gate adds nothing; and the pairs [h, p] it excludes, which
+    are its rivals and what is then beyond WIDE.
     """
     own, itself = _own(S), np.eye(len(d), dtype=bool)
     gain = np.einsum("hij,hjqk->hiqk", np.linalg.inv(own), S)
@@ -76,8 +77,8 @@ def _support(d, S, rivals):
     S_given[itself] = own
     e = np.where(itself, _squared(d, own), _squared(d_given, S_given))
     told = np.linalg.slogdet(own)[1] - np.linalg.slogdet(S_given)[1]
-    excludes = rivals | (e > GATE**2)
-    value = np.where(excludes, 0, GATE**2 - e + told)
+    excludes = rivals | (e > WIDE**2)  # of hundreds of true pairs some are beyond the gate
+    value = np.where(excludes, 0, np.maximum(GATE**2 - e + told, 0))
     return _of_rivals(value, rivals), excludes
 
 
