@@ -99,3 +99,10 @@ def test_of_none_none_is_chosen():
     assert compatible(d, S, among(0)) == []
     d, S = drifted([1.0])  # twenty standard deviations
     assert compatible(d, S, among(1)) == []
+
+
+def test_one_a_little_beyond_the_gate_keeps_no_others_back():
+    rng = np.random.default_rng(3)
+    d, S = drifted(0.06 + rng.normal(0, 0.3 * OWN, size=40))
+    d[7] = 0.06, 3.3 * OWN, 0.0  # of a hundred some are; all bear it out, and none has it
+    assert set(compatible(d, S, among(40))) >= set(range(40)) - {7}
