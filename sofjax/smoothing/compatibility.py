@@ -67,8 +67,8 @@ def _squared(d, own):
 
 def _support(d, S, rivals):
     """Of each pair [h] twice the log-likelihood that it adds if it is one: its own and that of all
-    that it bears out, where a pair at the gate adds nothing; and the pairs [h, p] it excludes, which
-    are its rivals and what is then beyond WIDE.
+    that it bears out, where a pair at the gate adds nothing; and the pairs [h, p] that it excludes,
+    which are its rivals and what is then beyond WIDE.
     """
     own, itself = _own(S), np.eye(len(d), dtype=bool)
     gain = np.einsum("hij,hjqk->hiqk", np.linalg.inv(own), S)
