@@ -8,8 +8,6 @@ What the oldest saw passes over into what is known of the lines, as if the pose 
 were exact.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -131,15 +129,15 @@ def slide(
 
 def _solve(rules, map_rules, sensor, model, window, segment_map, T_robot_foot, frame, reach):
     W, count = rules.keyframes, window.count + 1
-    some = dataclasses.replace(map_rules, nearby=rules.lines, candidates=1)
-    slots, _ = nearby(some, segment_map, frame.T_world_robot @ T_robot_foot, jnp.asarray(reach))
+    T_world_foot = frame.T_world_robot @ T_robot_foot
+    slots, _ = nearby(map_rules, segment_map, T_world_foot, reach, rules.lines)
     lines = segment_map.take(slots)
     known = jax.tree.map(lambda a: a.at[slots].get(mode="clip"), window.known)
     none = Known(lines.line, jnp.broadcast_to(jnp.eye(3), known.information.shape))
     known = _where(lines.valid, known, none)
 
     frames = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), window.keyframes, frame)
-    look = lambda frame: _look(some, sensor, lines, frame, T_robot_foot)
+    look = lambda frame: _look(map_rules, sensor, lines, frame, T_robot_foot)
     shown = jax.vmap(look)(frames)
     linear = lambda shown, frames, line: _linear(shown, frames, lines.anchor, line, T_robot_foot)
     oldest, (shown, frames) = (
@@ -195,7 +193,7 @@ class _Shown(eqx.Module):
 def _look(rules, sensor, lines, frame: Keyframe, T_robot_foot) -> _Shown:
     sightings, T_world_foot = frame.sightings, frame.T_world_robot @ T_robot_foot
     upright = eqx.tree_at(lambda s: s.line, sightings, sightings.under_tilt(frame.tilt))
-    _, at, error = propose(rules, sensor, lines, upright, T_world_foot)
+    _, at, error = propose(rules, sensor, lines, upright, T_world_foot, most=1)
     at, there = at[:, 0], sightings.valid & (error < GATE)
     of_each = jax.tree.map(lambda a: a[at], (lines.line, lines.anchor))
     expected, _ = jax.vmap(appear, in_axes=(0, 0, None))(*of_each, T_world_foot)
