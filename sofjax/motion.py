@@ -52,6 +52,31 @@ def _prior_sigma(model: MotionModel) -> Float[Array, "4"]:
     return jnp.stack([distance, turn, turn, curvature])
 
 
+def way_of(odometer: SE2) -> Float[Array, "*batch 3"]:
+    """Metres driven, radians turned left and, negative, right, as read."""
+    forward, _, turn = jnp.moveaxis(odometer.log(), -1, 0)
+    return jnp.stack([jnp.abs(forward), jnp.maximum(turn, 0), jnp.minimum(turn, 0)], axis=-1)
+
+
+def read_twist(odometer: SE2, way: Float[Array, "3"], b: Float[Array, "4"]) -> Float[Array, "3"]:
+    """What a reading says of the motion if its systematic errors are b."""
+    forward, sideways, turn = odometer.log()
+    distance, left, right = way
+    turn = turn + left * b[1] + right * b[2] + distance * b[3]
+    return jnp.stack([forward * (1 + b[0]), sideways, turn])
+
+
+def odometer_sigma(model: MotionModel, way: Float[Array, "3"], least: float) -> Float[Array, "3"]:
+    """Standard deviations of a reading's noise, metres and radians, after a way of `way_of`."""
+    distance, left, right = way
+    variance = jnp.stack([
+        model.distance_noise**2 * distance,
+        model.lateral_noise**2 * distance,
+        model.heading_noise**2 * distance + model.turn_noise**2 * (left - right),
+    ])  # fmt: skip
+    return jnp.sqrt(least**2 + variance)
+
+
 def sample_motion(
     model: MotionModel, bias: OdometerBias, odometer: SE2, key: PRNGKeyArray
 ) -> tuple[SE2, OdometerBias]:

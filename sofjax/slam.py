@@ -34,6 +34,7 @@ from sofjax.segment_map import (
 )
 from sofjax.sightings import SensorModel, free_direction, sight
 from sofjax.sof import SofExtraction, View, extract, keep_views, view_a_baseline_away
+from sofjax.window import Window, WindowRules, empty_window, slide
 
 SURE = 1.5  # noise up to which the sensor may convict the wheels of a slip
 LOST_AFTER = 10  # images without one known segment
@@ -63,6 +64,7 @@ class SlamConfig(eqx.Module):
     sensor: SensorModel = SensorModel()
     segment_map: MapRules = MapRules()
     filter: FilterRules = FilterRules()
+    window: WindowRules = WindowRules()
 
 
 class SlamState(eqx.Module):
@@ -75,6 +77,7 @@ class SlamState(eqx.Module):
     noise: Float[Array, ""]  # variance of the sightings as multiple of the sensor model's, >= 1
     unmatched: Int[Array, ""]  # images in a row without one known segment
     key: PRNGKeyArray
+    window: Window | None  # if some is smoothed while driving
 
 
 class StepInfo(eqx.Module):
@@ -115,9 +118,14 @@ def init(
         jnp.full(N, -jnp.log(N), float),
     )
     none = View(Segments(jnp.zeros((capacity, 2, 2)), jnp.zeros(capacity, bool)), SE2.identity())
+    window = None
+    if config.window.keyframes:
+        nothing = sight(config.sensor, camera, mount, none.segments_image, config.filter.max_depth)
+        window = empty_window(config.window, config.segment_map.capacity, nothing)
     return SlamState(
-        particles, empty_map(config.segment_map), none, none, jnp.ones(()), jnp.zeros((), int), key
-    )
+        particles, empty_map(config.segment_map), none, none, jnp.ones(()), jnp.zeros((), int),
+        key, window,
+    )  # fmt: skip
 
 
 def distribute(state: SlamState, mesh: jax.sharding.Mesh) -> SlamState:
@@ -221,12 +229,26 @@ def step(
     )
     known = counted & (best.error < sensor.e_max)
     new = is_sof & (nearest > sensor.e_max) & counted & ~known & ~sightings.upright
-    segment_map, overflow = integrate(
+    segment_map, overflow, new_at = integrate(
         rules, sensor, state.segment_map, near, sightings,
         jnp.take_along_axis(at, best.choice[:, None], 1)[:, 0], at,
         known, new, best.tilt,
         in_view(rules, camera, mount, lines, chosen), T_world_foot_chosen,
     )  # fmt: skip
+
+    # not in the paper: the last keyframes are smoothed, and all moves with the latest
+    window = state.window
+    if window is not None:
+        believed = OdometerBias(jnp.exp(weighted.log_weight) @ weighted.bias.mean, bias.covariance)
+        window, segment_map, T_new_old = slide(
+            config.window, rules, sensor, config.motion, window, segment_map,
+            mount.T_robot_foot, observation.motion, chosen, best.tilt, believed, sightings,
+            new_at, config.filter.max_depth,
+        )  # fmt: skip
+        chosen = T_new_old @ chosen
+        particles = eqx.tree_at(
+            lambda p: p.T_world_robot, particles, T_new_old @ particles.T_world_robot
+        )
 
     # 7) the next round starts from here
     recent, reference = keep_views(
@@ -258,7 +280,7 @@ def step(
             for stage in (detected, sightings.valid, sightings.valid & (known | new))
         ),
     )
-    return SlamState(particles, segment_map, recent, reference, noise, unmatched, key), info
+    return SlamState(particles, segment_map, recent, reference, noise, unmatched, key, window), info
 
 
 @jax.jit

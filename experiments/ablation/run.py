@@ -58,6 +58,8 @@ VARIANTS = {
         "motion": {"distance_scale_sigma": 0.0, "turn_scale_sigma": 0.0, "curvature_sigma": 0.0}
     },
     "no slips supposed": {"motion": {"slip_rate": 0.0}},
+    "12 keyframes smoothed": {"window": {"keyframes": 12}},
+    "8 keyframes smoothed": {"window": {"keyframes": 8}},
     "lever arm ignored": {},
 }
 DEFAULT, LEVER, HOUGH = "defaults", "lever arm ignored", "Hough"

@@ -23,8 +23,12 @@ def propose(
     segment_map: SegmentMap,
     sightings: Sightings,
     T_world_foot: SE2,
+    most: int | None = None,
 ) -> tuple[Candidates, Int[Array, "M C"], Float[Array, "M"]]:
     """The C map lines most like each sighting, as they should appear from the predicted foot.
+
+    **Arguments:**
+    - `most`: C, if not that of the rules.
 
     **Returns:** the candidates; their slots in the map; and for each sighting the smallest error
     of all map lines, overlapping or not by up to `join_gap`.
@@ -58,7 +62,7 @@ def propose(
     if rules.directed:
         possible = possible & (jnp.abs(wrap(observed.theta - lines.theta)) < jnp.pi / 2)
     error = jnp.where(possible, error, jnp.inf)
-    best, slot = _smallest(error, rules.candidates)
+    best, slot = _smallest(error, most or rules.candidates)
     far = rename_covariance(far[slot], jnp.take_along_axis(side, slot, axis=1))
     S = sightings.covariance[:, None] + far
     candidates = Candidates(

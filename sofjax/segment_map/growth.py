@@ -37,7 +37,7 @@ def integrate(
     tilt: Float[Array, "2"],
     in_view: Bool[Array, "L"],
     T_world_foot: SE2,
-) -> tuple[SegmentMap, Int[Array, ""]]:
+) -> tuple[SegmentMap, Int[Array, ""], Int[Array, "M"]]:
     """Step 6 of Fig. 6: an observed segment updates the known line `near[at]` or begins a new one.
 
     **Arguments:**
@@ -49,14 +49,14 @@ def integrate(
     - `in_view`: which of them this image should show, of `in_view`.
     - `T_world_foot`: the chosen pose.
 
-    **Returns:** the map, and how many new lines found no free slot.
+    **Returns:** the map; how many new lines found no free slot; and the slot of each, K for none.
     """
     some = segment_map.take(near)
     some = _update(rules, sensor, some, sightings, at, known, tilt, in_view, T_world_foot)
     some = _merge(rules, some, at, like, known)
     segment_map = _age(segment_map, sightings).put(near, some)
-    segment_map, overflow = _insert(rules, segment_map, sightings, new, tilt, T_world_foot)
-    return _forget(rules, segment_map), overflow
+    segment_map, overflow, slot = _insert(rules, segment_map, sightings, new, tilt, T_world_foot)
+    return _forget(rules, segment_map), overflow, slot
 
 
 class _Measurement(eqx.Module):
@@ -198,18 +198,22 @@ def _insert(rules, m, sightings, new, tilt, T_world_foot):
     covariance = covariance.at[:, 2, 2].set(rules.kappa_sigma**2)
     put = lambda a, b: a.at[slot].set(b, mode="drop")
     overflow = jnp.sum(new & (slot == K))
-    return SegmentMap(
-        segments_world=Segments(
-            put(m.segments_world.endpoints, T_world_foot.apply(near)), put(m.valid, True)
+    return (
+        SegmentMap(
+            segments_world=Segments(
+                put(m.segments_world.endpoints, T_world_foot.apply(near)), put(m.valid, True)
+            ),
+            anchor=SE2(put(m.anchor.xy, T_world_foot.xy), put(m.anchor.yaw, T_world_foot.yaw)),
+            line=put(m.line, line),
+            covariance=put(m.covariance, covariance),
+            updates=put(m.updates, 1),
+            resting=put(m.resting, 0),
+            unseen=put(m.unseen, 0),
+            expected=put(m.expected, 1),
         ),
-        anchor=SE2(put(m.anchor.xy, T_world_foot.xy), put(m.anchor.yaw, T_world_foot.yaw)),
-        line=put(m.line, line),
-        covariance=put(m.covariance, covariance),
-        updates=put(m.updates, 1),
-        resting=put(m.resting, 0),
-        unseen=put(m.unseen, 0),
-        expected=put(m.expected, 1),
-    ), overflow
+        overflow,
+        slot,
+    )
 
 
 def _merge(rules, m, at, like, known):

@@ -131,7 +131,11 @@ RUNGS = 16  # radii to choose from where there are more lines than an image may 
 
 
 def nearby(
-    rules: MapRules, segment_map: SegmentMap, T_world_foot: SE2, reach: Float[Array, ""]
+    rules: MapRules,
+    segment_map: SegmentMap,
+    T_world_foot: SE2,
+    reach: Float[Array, ""] | float,
+    most: int | None = None,
 ) -> tuple[Int[Array, "L"], Int[Array, ""]]:
     """The slots of the lines nearest to a foot: the one pass over the whole map in a step.
 
@@ -141,12 +145,13 @@ def nearby(
 
     **Arguments:**
     - `reach`: metres that the farthest point seen, and what may match it, is away.
+    - `most`: L, if not that of the rules.
 
     **Returns:** the slots in ascending order, K for none; and how many lines within `reach` are
     not among them.
     """
     K = segment_map.updates.shape[0]
-    L = min(rules.nearby, K)
+    L = min(most or rules.nearby, K)
     ends = segment_map.segments_world.endpoints - T_world_foot.xy
     x, y = ends[:, 0, 0], ends[:, 0, 1]
     u, v = ends[:, 1, 0] - x, ends[:, 1, 1] - y

@@ -6,6 +6,7 @@ import numpy as np
 
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
+from sofjax.motion import way_of
 from sofjax.observation import Observation
 from sofjax.smoothing.problem import Keyframes
 
@@ -63,10 +64,7 @@ def _gather(log, index, count):
     motion = log.motion
     identity = SE2(jnp.zeros(2, motion.xy.dtype), jnp.zeros((), motion.yaw.dtype))
     _, poses = jax.lax.scan(lambda T, m: (T @ m, T @ m), identity, motion)
-    forward, _, turn = jnp.moveaxis(motion.log(), -1, 0)
-    totals = jnp.cumsum(
-        jnp.stack([jnp.abs(forward), jnp.maximum(turn, 0), jnp.minimum(turn, 0)]), 1
-    )
+    totals = jnp.cumsum(way_of(motion), axis=0)
 
     before = jnp.append(index[:1], index[:-1])
     at = lambda i: jax.tree.map(lambda a: a[i], poses)
@@ -74,7 +72,7 @@ def _gather(log, index, count):
     real = jnp.arange(index.shape[0]) < count
     segments = Segments(segments.endpoints, segments.valid & real[:, None])
     none = jnp.zeros(segments.valid.shape, int)
-    way = (totals[:, index] - totals[:, before]).T
+    way = totals[index] - totals[before]
     return Keyframes(segments, none, none > 0, at(before).between(at(index)), way)
 
 

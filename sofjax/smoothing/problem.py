@@ -11,7 +11,7 @@ from sofjax.geometry.floor import floor_homography
 from sofjax.geometry.lines import cofactor, line_point_distance
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-from sofjax.motion import MotionModel, prior_bias
+from sofjax.motion import MotionModel, odometer_sigma, prior_bias, read_twist
 from sofjax.segment_map import appear
 
 POSE, LINE, SHARED = 5, 3, 8  # unknowns of a keyframe, of a line, and of the whole drive
@@ -50,6 +50,7 @@ class Priors(eqx.Module):
     kappa_sigma: float = 0.3  # of a line that is not on the floor
 
 
+LEAST = 1e-3  # metres or radians: keyframes have moved by much more
 FIXED = 1e-7  # the standard deviation of what is not free
 
 
@@ -123,23 +124,9 @@ def odometer_residual(
     shared: Float[Array, "8"], motion: SE2, way: Float[Array, "3"],
 ) -> Float[Array, "3"]:  # fmt: skip
     """Motion against reading, (forward, sideways, turn), by the motion model's noise."""
-    model, b = problem.motion_model, shared[4:]
     moved = SE2(before[:2], before[2]).between(SE2(after[:2], after[2])).log()
-    forward, sideways, turn = motion.log()
-    distance, left, right = way
-    read = jnp.stack(
-        [forward * (1 + b[0]), sideways, turn + left * b[1] + right * b[2] + distance * b[3]]
-    )
-    floor = 1e-3  # metres or radians: keyframes have moved by much more
-    sigma = jnp.sqrt(
-        floor**2
-        + jnp.stack([
-            model.distance_noise**2 * distance,
-            model.lateral_noise**2 * distance,
-            model.heading_noise**2 * distance + model.turn_noise**2 * (left - right),
-        ])
-    )  # fmt: skip
-    return (moved - read) / sigma
+    sigma = odometer_sigma(problem.motion_model, way, LEAST)
+    return (moved - read_twist(motion, way, shared[4:])) / sigma
 
 
 def distances(unknowns: Unknowns, problem: Problem) -> Float[Array, "n M 2"]:
