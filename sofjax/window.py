@@ -118,7 +118,8 @@ def slide(
     last = jax.tree.map(lambda a: a[-1], window.keyframes.T_world_robot)
     off = last.between(T_world_robot).log() - read_twist(motion, way, bias.mean)
     error = jnp.sum((off / odometer_sigma(model, way, LEAST)) ** 2)
-    trust = jnp.where(window.count == 0, 0, jnp.minimum(1, SLIPPED / jnp.maximum(error, 1e-6)))
+    trust = jnp.minimum(1, jnp.sqrt(SLIPPED / jnp.maximum(error, 1e-6)))
+    trust = jnp.where(window.count == 0, 0, trust)
     sightings = eqx.tree_at(lambda s: s.valid, sightings, usable)
     frame = Keyframe(T_world_robot, tilt, sightings, motion, way, trust, bias)
     solve = lambda: _solve(
@@ -270,7 +271,7 @@ def _odometry(model, sensor, frames: Keyframe, bias, believed: OdometerBias, x) 
     )
     twist = jax.vmap(read_twist, in_axes=(0, 0, None))(read.motion, read.way, b)
     sigma = jax.vmap(odometer_sigma, in_axes=(None, 0, None))(model, read.way, LEAST)
-    off = (before.between(after).log() - twist) / sigma * jnp.sqrt(read.trust)[:, None]
+    off = (before.between(after).log() - twist) / sigma * read.trust[:, None]
     wobble = (frames.tilt + pose[:, 3:]) / jnp.maximum(sensor.tilt_sigma, 1e-7)
     root = jnp.linalg.cholesky(believed.covariance + 1e-10 * jnp.eye(BIAS))
     prior = solve_triangular(root, b - believed.mean, lower=True)

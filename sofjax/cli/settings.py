@@ -29,6 +29,8 @@ LIMITS = {
     "filter.particles": (1, 1_000_000),
     "segment_map.capacity": (8, 65_536),
     "segment_map.candidates": (1, 8),
+    "window.keyframes": (0, 64),
+    "window.lines": (8, 1024),
     "association.temperature": (1e-3, 1e3),
 }
 
