@@ -59,7 +59,6 @@ VARIANTS = {
     },
     "no slips supposed": {"motion": {"slip_rate": 0.0}},
     "12 keyframes smoothed": {"window": {"keyframes": 12}},
-    "8 keyframes smoothed": {"window": {"keyframes": 8}},
     "lever arm ignored": {},
 }
 DEFAULT, LEVER, HOUGH = "defaults", "lever arm ignored", "Hough"
