@@ -59,7 +59,7 @@ def sightings_of(*ends, sigma=0.01):
 
 
 def see(segment_map, *ends, at=None, slots=None, rules=GAMMA, sigma=0.01, view=()):
-    """The map after one image: sightings of the lines in `slots`, or new ones."""
+    """The map after one image, of lines in `slots` or new ones; and how many found no place."""
     at = pose() if at is None else at
     known = jnp.arange(M) < len(slots or ())
     slot = jnp.array([*(slots or ()), *[0] * M], int)[:M]
@@ -69,7 +69,7 @@ def see(segment_map, *ends, at=None, slots=None, rules=GAMMA, sigma=0.01, view=(
     return grow(
         rules, STIFF, segment_map, jnp.arange(K), sightings, slot, everything(K), known, new,
         jnp.zeros(2), shown, at,
-    )  # fmt: skip
+    )[:2]  # fmt: skip
 
 
 def seen(segment_map, *ends, **options):
@@ -145,6 +145,17 @@ def test_what_finds_no_place_is_counted_and_changes_nothing():
     again, overflow = see(after, across(4.5))
     assert overflow == 1
     np.testing.assert_array_equal(again.segments_world.endpoints, after.segments_world.endpoints)
+
+
+def test_where_new_lines_begin_is_told():
+    m, s = seen(empty_map(GAMMA), across(1.0)), sightings_of(across(1.0), across(2.0), across(3.0))
+    known = jnp.arange(M) < 1
+    after, _, slot = grow(
+        GAMMA, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), everything(K), known,
+        s.valid & ~known, jnp.zeros(2), jnp.zeros(K, bool), pose(),
+    )  # fmt: skip
+    np.testing.assert_array_equal(slot, [K, 1, 2] + [K] * (M - 3))
+    assert offset(after, 2) == pytest.approx(3)
 
 
 # Eq. (14)
@@ -538,7 +549,7 @@ def test_a_wobble_is_taken_out_of_what_is_integrated():
     )
     m = seen(empty_map(GAMMA), across(1.0))
     known = jnp.arange(M) < 1
-    after, _ = grow(
+    after, *_ = grow(
         GAMMA, STIFF, m, jnp.arange(K), sightings, jnp.zeros(M, int), everything(K), known,
         ~known & sightings.valid, jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
     )  # fmt: skip
@@ -663,7 +674,7 @@ def test_lines_beyond_those_nearby_only_age():
     near, _ = nearby(rules, m, pose(), jnp.array(6.0))
     np.testing.assert_array_equal(near, [0, 1])
     known = jnp.arange(M) < 1
-    after, _ = jit_quickly(integrate)(
+    after, *_ = jit_quickly(integrate)(
         rules, STIFF, m, near, sightings_of(across(2.2)), jnp.ones(M, int), everything(len(near)),
         known, ~known & known, jnp.zeros(2), jnp.zeros(2, bool), pose(),
     )  # fmt: skip
