@@ -59,7 +59,7 @@ def way_of(odometer: SE2) -> Float[Array, "*batch 3"]:
 
 
 def read_twist(odometer: SE2, way: Float[Array, "3"], b: Float[Array, "4"]) -> Float[Array, "3"]:
-    """What a reading says of the motion if its systematic errors are b."""
+    """What a reading says of the motion if its systematic errors are b: (v_x, v_y, omega)."""
     forward, sideways, turn = odometer.log()
     distance, left, right = way
     turn = turn + left * b[1] + right * b[2] + distance * b[3]
@@ -67,7 +67,9 @@ def read_twist(odometer: SE2, way: Float[Array, "3"], b: Float[Array, "4"]) -> F
 
 
 def odometer_sigma(model: MotionModel, way: Float[Array, "3"], least: float) -> Float[Array, "3"]:
-    """Standard deviations of a reading's noise, metres and radians, after a way of `way_of`."""
+    """Standard deviations of a reading's noise (v_x, v_y, omega) after a way of `way_of`, metres
+    and radians; `least` of them is left where nothing was driven.
+    """
     distance, left, right = way
     variance = jnp.stack([
         model.distance_noise**2 * distance,

@@ -237,9 +237,10 @@ def step(
     )  # fmt: skip
 
     # not in the paper: the last keyframes are smoothed, and all moves with the latest
+    mean_bias = jnp.exp(weighted.log_weight) @ weighted.bias.mean
     window = state.window
     if window is not None:
-        believed = OdometerBias(jnp.exp(weighted.log_weight) @ weighted.bias.mean, bias.covariance)
+        believed = OdometerBias(mean_bias, bias.covariance)
         window, segment_map, T_new_old = slide(
             config.window, rules, sensor, config.motion, window, segment_map,
             mount.T_robot_foot, observation.motion, chosen, best.tilt, believed, sightings,
@@ -261,7 +262,7 @@ def step(
     info = StepInfo(
         T_world_robot=chosen,
         covariance=pose_covariance(weighted),
-        bias=jnp.exp(weighted.log_weight) @ weighted.bias.mean,
+        bias=mean_bias,
         effective_size=size,
         log_evidence=log_evidence,
         tilt=best.tilt,

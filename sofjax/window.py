@@ -104,7 +104,7 @@ def slide(
     **Returns:** the window, the map, and T_new_old, by which all that moves with the robot is to
     be moved: the identity if the image is no keyframe, or the solution is not finite.
     """
-    loosely = jnp.diag(jnp.array([NEW, NEW, 1.0]).at[2].set(map_rules.kappa_sigma) ** -2)
+    loosely = jnp.diag(jnp.array([NEW, NEW, map_rules.kappa_sigma]) ** -2)
     put = lambda a, b: a.at[new].set(b, mode="drop")
     begun = segment_map.line.at[new].get(mode="clip")
     known = Known(put(window.known.line, begun), put(window.known.information, loosely))
@@ -169,7 +169,8 @@ def _solve(rules, map_rules, sensor, model, window, segment_map, T_robot_foot, f
     )  # fmt: skip
     segment_map = segment_map.put(slots, _where(fine & seen, moved, lines))
     frames = jax.tree.map(lambda a, b: jnp.where(fine, a, b), solved, frames)
-    of_all = jax.tree.map(lambda a, b: a.at[slots].set(b, mode="drop"), window.known, known)
+    put = lambda a, b: jnp.where(fine, a.at[slots].set(b, mode="drop"), a)
+    of_all = jax.tree.map(put, window.known, known)
     latest = jax.tree.map(lambda a: a[-1], frames.T_world_robot)
     window = Window(frames, count, of_all, SE2.identity(), jnp.zeros(3))
     return window, segment_map, latest @ frame.T_world_robot.inverse()
@@ -193,8 +194,8 @@ class _Shown(eqx.Module):
 
 def _look(rules, sensor, lines, frame: Keyframe, T_robot_foot) -> _Shown:
     sightings, T_world_foot = frame.sightings, frame.T_world_robot @ T_robot_foot
-    upright = eqx.tree_at(lambda s: s.line, sightings, sightings.under_tilt(frame.tilt))
-    _, at, error = propose(rules, sensor, lines, upright, T_world_foot, most=1)
+    level = eqx.tree_at(lambda s: s.line, sightings, sightings.under_tilt(frame.tilt))
+    _, at, error = propose(rules, sensor, lines, level, T_world_foot, most=1)
     at, there = at[:, 0], sightings.valid & (error < GATE)
     of_each = jax.tree.map(lambda a: a[at], (lines.line, lines.anchor))
     expected, _ = jax.vmap(appear, in_axes=(0, 0, None))(*of_each, T_world_foot)
@@ -246,19 +247,18 @@ def _by_line(linear: _Linear, a: Array) -> Array:
     return jax.ops.segment_sum(a.reshape(-1, *a.shape[2:]), linear.line.reshape(-1), linear.lines)
 
 
+def _of_lines(known: Known, about: Float[Array, "J 3"], linear: _Linear) -> tuple[Array, Array]:
+    """Normal equations [J, 3, 3] and [J, 3] of the lines' steps from `about`, given the poses."""
+    JW = jnp.einsum("fmia,fmij->fmaj", linear.by_line, linear.weight)
+    gradient = _by_line(linear, jnp.einsum("fmaj,fmj->fma", JW, linear.error))
+    prior = jnp.einsum("kab,kb->ka", known.information, known.line - about)
+    return known.information + _by_line(linear, JW @ linear.by_line), gradient + prior
+
+
 def _learned(known: Known, about: Float[Array, "J 3"], linear: _Linear) -> Known:
     """What is known of the lines with some sightings more, which were linearised about `about`."""
-    JW = jnp.einsum("fmia,fmij->fmaj", linear.by_line, linear.weight)
-    information = known.information + _by_line(linear, JW @ linear.by_line)
-    error = linear.error + jnp.einsum(
-        "fmia,fma->fmi", linear.by_line, (about - known.line)[linear.line]
-    )
-    gradient = _by_line(linear, jnp.einsum("fmaj,fmj->fma", JW, error))
-    return Known(known.line + _solved(information, gradient), information)
-
-
-def _solved(A, b):
-    return jnp.linalg.solve(A, b[..., None])[..., 0]
+    information, gradient = _of_lines(known, about, linear)
+    return Known(about + jnp.linalg.solve(information, gradient[..., None])[..., 0], information)
 
 
 def _odometry(model, sensor, frames: Keyframe, bias, believed: OdometerBias, x) -> Array:
@@ -285,16 +285,12 @@ def _step(linear: _Linear, known: Known, floor, odometry, held, line):
     JlW = jnp.einsum("wmia,wmij->wmaj", linear.by_line, linear.weight)
     zero = jnp.zeros(n)
     r, J = odometry(zero), jax.jacfwd(odometry)(zero)
-    of_pose = jnp.einsum("wmaj,wmjb,wv->wavb", JpW, linear.by_pose, jnp.eye(W)).reshape(
-        W * POSE, -1
-    )
-    A = J.T @ J + jnp.pad(of_pose, (0, BIAS))
+    of_pose = jnp.einsum("wmaj,wmjb,wv->wavb", JpW, linear.by_pose, jnp.eye(W))
+    A = J.T @ J + jnp.pad(of_pose.reshape(W * POSE, W * POSE), (0, BIAS))
     b = jnp.pad(jnp.einsum("wmaj,wmj->wa", JpW, linear.error).reshape(-1), (0, BIAS)) - J.T @ r
 
     # of the lines, and between those and the poses
-    C = known.information + _by_line(linear, JlW @ linear.by_line)
-    c = _by_line(linear, jnp.einsum("wmaj,wmj->wma", JlW, linear.error))
-    c = c + jnp.einsum("kab,kb->ka", known.information, known.line - line)
+    C, c = _of_lines(known, line, linear)
     C, c = C.at[:, 2, 2].add(floor), c.at[:, 2].add(floor * (1 - line[:, 2]))
     frame = jnp.broadcast_to(jnp.arange(W)[:, None], linear.line.shape)
     E = jnp.zeros((linear.lines, W, 3, POSE)).at[linear.line, frame].add(JlW @ linear.by_pose)

@@ -120,7 +120,7 @@ def map_of(sightings, T_world_foot):
     )  # fmt: skip
 
 
-def test_a_drive_is_compiled_once_and_ends_nearer_to_the_truth():
+def test_a_drive_is_compiled_once_and_stays_near_the_truth():
     step = jit_quickly(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
     true, observations = drive()
     state, xy = start(OPEN), []

@@ -198,22 +198,19 @@ def _insert(rules, m, sightings, new, tilt, T_world_foot):
     covariance = covariance.at[:, 2, 2].set(rules.kappa_sigma**2)
     put = lambda a, b: a.at[slot].set(b, mode="drop")
     overflow = jnp.sum(new & (slot == K))
-    return (
-        SegmentMap(
-            segments_world=Segments(
-                put(m.segments_world.endpoints, T_world_foot.apply(near)), put(m.valid, True)
-            ),
-            anchor=SE2(put(m.anchor.xy, T_world_foot.xy), put(m.anchor.yaw, T_world_foot.yaw)),
-            line=put(m.line, line),
-            covariance=put(m.covariance, covariance),
-            updates=put(m.updates, 1),
-            resting=put(m.resting, 0),
-            unseen=put(m.unseen, 0),
-            expected=put(m.expected, 1),
+    grown = SegmentMap(
+        segments_world=Segments(
+            put(m.segments_world.endpoints, T_world_foot.apply(near)), put(m.valid, True)
         ),
-        overflow,
-        slot,
+        anchor=SE2(put(m.anchor.xy, T_world_foot.xy), put(m.anchor.yaw, T_world_foot.yaw)),
+        line=put(m.line, line),
+        covariance=put(m.covariance, covariance),
+        updates=put(m.updates, 1),
+        resting=put(m.resting, 0),
+        unseen=put(m.unseen, 0),
+        expected=put(m.expected, 1),
     )
+    return grown, overflow, slot
 
 
 def _merge(rules, m, at, like, known):
