@@ -99,6 +99,21 @@ def _dense_of(blocks, keyframes):
     return np.triu(A) + np.triu(A, 1).T
 
 
+def test_the_derivatives_of_all_residuals_are_central_differences(problem):
+    problem, _ = problem
+    with jax.enable_x64(True):
+        flat, restore = jax.flatten_util.ravel_pytree(problem.start)
+        f = lambda x: jax.flatten_util.ravel_pytree(residuals(restore(x), problem))[0]
+        steps = 1e-5 * jnp.eye(len(flat))
+        of_all = jax.jit(jax.vmap(f))
+        central = lambda h: (of_all(flat + h * steps) - of_all(flat - h * steps)).T / (2e-5 * h)
+        expected = (4 * central(0.5) - central(1.0)) / 3
+        found = jax.jit(jax.jacfwd(f))(flat)
+        scale = 1e-3 + jnp.abs(expected).max(axis=1, keepdims=True)  # of each residual
+        np.testing.assert_allclose(found / scale, expected / scale, atol=1e-6)
+        assert (jnp.abs(found) > 0).any(axis=0).all()  # each unknown is told by some
+
+
 def test_assembled_blocks_are_those_of_the_dense_normal_equations(problem):
     problem, _ = problem
     with jax.enable_x64(True):
