@@ -94,23 +94,30 @@ def compare(
     x, y, yaw = T_predicted_foot.xy[..., 0], T_predicted_foot.xy[..., 1], T_predicted_foot.yaw
     of_poses = lambda a: a.reshape(*a.shape, *[1] * len(poses))
     there = sightings.valid[:, None] & candidates.valid
-    d_rho, d_theta, by_x, by_y, loose, W = jax.tree.map(
+    difference, loose, W = jax.tree.map(
         lambda a: jnp.where(there, a, 0),
-        (*_differences(sightings, candidates), _symmetric(candidates.precision_tilt),
+        (_differences(sightings, candidates), _symmetric(candidates.precision_tilt),
          _symmetric(candidates.precision)),
     )  # fmt: skip
+    d_rho, d_theta, by_x, by_y = difference
 
-    def error(W, of, rho=0.0, theta=0.0):
-        moved = of(d_rho) + (of(by_x) * x + of(by_y) * y), of(d_theta) + yaw
+    def error(W, of, difference, rho=0.0, theta=0.0):
+        d_rho, d_theta, by_x, by_y = map(of, difference)
+        moved = d_rho + (by_x * x + by_y * y), d_theta + yaw
         return _quadratic([of(w) for w in W], moved[0] - rho, moved[1] - theta)
 
-    least = jnp.full((len(there), *poses), sensor.e_max)
-    choice = jnp.full(least.shape, C)  # none
-    for c in range(C):
-        of_this = lambda a, c=c: of_poses(a[:, c])
-        e = jnp.where(of_this(there), error(loose, of_this), jnp.inf)
-        least, choice = jnp.where(e < least, e, least), jnp.where(e < least, c, choice)
-    choice = jnp.where(used, choice, C)
+    # a scan, as whoever asks for the choice would otherwise work all errors out anew
+    width = 1 << C.bit_length()
+
+    def nearer(best, candidate):
+        c, there, loose, difference = candidate
+        key = sortable(error(loose, of_poses, difference), c, width)
+        return jnp.where(of_poses(there) & (key < best), key, best), None
+
+    none = jnp.full((len(there), *poses), sortable(jnp.asarray(sensor.e_max), C, width))
+    each = jax.tree.map(lambda a: a.T, (there, loose, difference))
+    choice = jax.lax.scan(nearer, none, (jnp.arange(C), *each))[0] & (width - 1)
+    choice = jnp.where(used, choice, C).astype(int)
 
     def of_choice(a):
         value = jnp.zeros(())
@@ -132,10 +139,23 @@ def compare(
     tilt, _, prior = _solve_tilt(sensor, sums[:3], gradient)
 
     rho, theta = (of_poses(J[:, i, 0]) * tilt[0] + of_poses(J[:, i, 1]) * tilt[1] for i in range(2))
-    tight = jnp.minimum(error(W, of_choice, rho, theta), sensor.e_max)
+    tight = jnp.minimum(error(W, of_choice, difference, rho, theta), sensor.e_max)
     tight = jnp.where(choice < C, tight, sensor.e_max)
     total = jnp.sum(jnp.where(of_poses(sightings.valid), tight, 0), axis=0)
     return Comparison(-0.5 * (total + prior), jnp.where(choice < C, choice, 0), tight, tilt)
+
+
+def sortable(
+    error: Float[Array, "*#shape"], index: Int[Array, "*#shape"] | int, width: int
+) -> Int[Array, "*shape"]:
+    """Errors and the indices that go with them as one number: a minimum then says both.
+
+    Numbers that are not negative are ordered as their bits are, the last of which give way to the
+    index: with those for `width` (a power of two) errors alike to one in 2^23 / width are ordered
+    by their index. Modulo `width` it is the index again.
+    """
+    bits = jax.lax.bitcast_convert_type(jnp.abs(error).astype(jnp.float32), jnp.int32)
+    return (bits & -width) | jnp.asarray(index, jnp.int32)
 
 
 def log_density(

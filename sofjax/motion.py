@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sofjax.geometry.angles import safe_sqrt
@@ -109,10 +110,12 @@ def sample_motion(
     S = A @ covariance @ A.T + noise  # diagonal: distance and turn share no error
     sigma = safe_sqrt(jnp.diag(S))
     # one draw for all: a key for each particle costs more than the rest of this
-    draw = jax.random.normal(key, (*bias.mean.shape[:-1], 3))
-    innovation = sigma * draw[..., :2]
+    draw = jax.random.normal(key, (3, *bias.mean.shape[:-1]))
+    sigmas = jnp.append(sigma, model.lateral_noise * safe_sqrt(distance))
+    noise = jnp.tensordot(draw, jnp.diag(sigmas), axes=(0, 0))
+    innovation = noise[..., :2]
     moved = jnp.stack([forward, turn]) + bias.mean @ A.T + innovation
-    across = sideways + model.lateral_noise * safe_sqrt(distance) * draw[..., 2]
+    across = sideways + noise[..., 2]
 
     gain = covariance @ A.T / jnp.where(sigma > 0, sigma, 1) ** 2
     learned = OdometerBias(bias.mean + innovation @ gain.T, covariance - gain @ A @ covariance)
@@ -143,12 +146,13 @@ def sample_slip(
     """
     probability = jnp.minimum(model.slip_rate * jnp.abs(odometer.log()[0]), SLIPPED)
     possible = testable & (probability > 0)
-    key_which, key_size = jax.random.split(key)
-    slips = possible & (jax.random.uniform(key_which, shape) < SLIPPED)
-    sigma = jnp.stack([jnp.asarray(s, float) for s in (model.slip_distance, 0.0, model.slip_turn)])
-    slip = sigma * jax.random.normal(key_size, (*shape, 3))
+    which, *size = jax.random.normal(key, (3, *shape))  # one draw for all that is random here
+    slips = possible & (which < ndtri(SLIPPED))
+    along, turn = (jnp.asarray(s, float) for s in (model.slip_distance, model.slip_turn))
+    sigmas = jnp.zeros((2, 3)).at[0, 0].set(along).at[1, 2].set(turn)
+    twist = jnp.tensordot(jnp.where(slips, jnp.stack(size), 0), sigmas, axes=(0, 0))
     probability = jnp.where(possible, probability, SLIPPED)
     log_weight = jnp.where(
         slips, jnp.log(probability / SLIPPED), jnp.log1p(-probability) - jnp.log1p(-SLIPPED)
     )
-    return SE2.exp(jnp.where(slips[..., None], slip, 0)), jnp.where(possible, log_weight, 0)
+    return SE2.exp(twist), jnp.where(possible, log_weight, 0)

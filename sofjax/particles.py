@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int
 
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
@@ -40,16 +40,20 @@ def effective_size(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
     return jnp.exp(-jax.nn.logsumexp(2 * log_weight))
 
 
-def systematic(key: PRNGKeyArray, log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
-    """Indices drawn by systematic resampling: one uniform number and N equally spaced teeth."""
+def systematic(tooth: Float[Array, ""], log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
+    """Indices drawn by systematic resampling, with N equally spaced teeth.
+
+    **Arguments:**
+    - `tooth`: where the first stands, a uniform number of [0, 1).
+    """
     N = log_weight.shape[0]
     cumulative = jnp.cumsum(jnp.exp(log_weight))
-    teeth = (jax.random.uniform(key) + jnp.arange(N, dtype=float)) / N * cumulative[-1]
-    return jnp.clip(jnp.searchsorted(cumulative, teeth), 0, N - 1)
+    teeth_up_to = jnp.ceil(N * cumulative / cumulative[-1] - tooth).astype(int)
+    return jnp.repeat(jnp.arange(N), jnp.diff(teeth_up_to, prepend=0), total_repeat_length=N)
 
 
 def draw_across(
-    key: PRNGKeyArray,
+    teeth: Float[Array, "2"],
     particles: Particles,
     T_tried: SE2,
     log_likelihood: Float[Array, "N"],
@@ -63,16 +67,16 @@ def draw_across(
     follow by regression on what is taken, as the yaw is what they are learned by.
 
     **Arguments:**
+    - `teeth`: uniform numbers of [0, 1), to draw what was not seen and what was.
     - `T_tried`: [N] the poses that were compared: those of the particles and what these were tried
       with besides, such as a slip of the wheels. Of that too only what was seen is taken.
     - `free`: the direction, radians in the world.
 
     **Returns:** particles of equal weights.
     """
-    key_own, key_seen = jax.random.split(key)
-    own = systematic(key_own, particles.log_weight)  # all, each once, if their weights are equal
+    own = systematic(teeth[0], particles.log_weight)  # all, each once, if their weights are equal
     log_seen = log_likelihood[own]
-    seen = own[systematic(key_seen, log_seen - jax.nn.logsumexp(log_seen))]
+    seen = own[systematic(teeth[1], log_seen - jax.nn.logsumexp(log_seen))]
     particles = particles.take(own)
 
     middle = mean_pose(particles)
@@ -113,5 +117,5 @@ def pose_covariance(particles: Particles) -> Float[Array, "3 3"]:
     in it.
     """
     mean, T = mean_pose(particles), particles.T_world_robot
-    d = jnp.concatenate([T.xy - mean.xy, (T.yaw - mean.yaw)[:, None]], axis=1)
-    return (jnp.exp(particles.log_weight)[:, None] * d).T @ d
+    d = jnp.stack([T.xy[:, 0] - mean.xy[0], T.xy[:, 1] - mean.xy[1], T.yaw - mean.yaw])
+    return (jnp.exp(particles.log_weight) * d) @ d.T

@@ -13,6 +13,7 @@ from sofjax.geometry.segments import Segments
 from sofjax.likelihood import adapt_noise, compare, log_density, pixels_and_weight
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, sample_slip
 from sofjax.observation import Observation
+from sofjax.padding import half_if_enough, in_any_run
 from sofjax.particles import (
     Particles,
     draw_across,
@@ -191,14 +192,19 @@ def step(
     lines = state.segment_map.take(near)
     candidates, at, nearest = propose(rules, sensor, lines, sightings, T_world_foot)
     feet = T_world_foot.inverse() @ (T_world_robot @ mount.T_robot_foot)
+    counted = lambda T: sof(T).is_floor if config.filter.gate_each else sightings.valid
+    seen_from = lambda T: compare(
+        sensor, sightings, candidates, T_world_foot.between(T @ mount.T_robot_foot), counted(T)
+    )
     if config.filter.soft:
         unused = observation.segments_image.valid & ~sightings.valid
         many = in_view(rules, camera, mount, lines, predicted).sum(), unused.sum()
         of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, *many)
         log_likelihood = jax.vmap(of_soft)(feet, used)
     else:
-        found = compare(sensor, sightings, candidates, feet, used.T)
-        log_likelihood = weight * found.log_likelihood
+        of_hard = lambda rows: compare(sensor, *rows[:2], feet, rows[2]).log_likelihood
+        rows = sightings, candidates, used.T
+        log_likelihood = weight * half_if_enough(of_hard, rows, sightings.valid)
     log_weight = moved.log_weight + log_likelihood
     log_evidence = jax.nn.logsumexp(log_weight)
     weighted = Particles(T_world_robot, bias, log_weight - log_evidence)
@@ -206,34 +212,38 @@ def step(
     if config.filter.choice == "winner":
         particles = weighted.take(winner(weighted.log_weight))
         chosen = mean_pose(particles)
+        best = seen_from(chosen)
     else:
-        if not config.filter.soft:  # whose gradient needs particles that are drawn as a whole
-            likeliest = found.error[:, jnp.argmax(log_weight)]
-            free, parallel = free_direction(sightings, sightings.valid & (likeliest < sensor.e_max))
-            of_seen = log_ratio + log_likelihood, predicted.yaw + free
-            weighted = jax.lax.cond(
-                parallel,
-                lambda: draw_across(key_choice, unslipped, T_world_robot, *of_seen),
-                lambda: weighted,
-            )
+        teeth = jax.random.uniform(key_choice, (3,))
         chosen = mean_pose(weighted)
-        resampled = weighted.take(systematic(key_choice, weighted.log_weight), config.filter.soft)
+        best = seen_from(chosen)
+        if not config.filter.soft:  # whose gradient needs particles that are drawn as a whole
+            free, parallel = free_direction(sightings, best.error < sensor.e_max)
+
+            def across():
+                of_seen = log_ratio + log_likelihood, predicted.yaw + free
+                drawn = draw_across(teeth[:2], unslipped, T_world_robot, *of_seen)
+                return jax.tree.map(lambda a, b: jnp.where(parallel, a, b), drawn, weighted)
+
+            # what is seen stays the same all along it, and so `best`
+            weighted = jax.lax.cond(in_any_run(parallel), across, lambda: weighted)
+            chosen = mean_pose(weighted)
         few = effective_size(weighted.log_weight) < config.filter.effective_share * N
-        particles = jax.tree.map(lambda a, b: jnp.where(few, a, b), resampled, weighted)
+
+        def resampled():
+            drawn = weighted.take(systematic(teeth[2], weighted.log_weight), config.filter.soft)
+            return jax.tree.map(lambda a, b: jnp.where(few, a, b), drawn, weighted)
+
+        particles = jax.lax.cond(in_any_run(few), resampled, lambda: weighted)
 
     # 6) integrate the observed segments into the map, as seen from the chosen pose
-    T_world_foot_chosen = chosen @ mount.T_robot_foot
-    counted = sof(chosen).is_floor if config.filter.gate_each else sightings.valid
-    best = compare(
-        sensor, sightings, candidates, T_world_foot.between(T_world_foot_chosen), counted
-    )
-    known = counted & (best.error < sensor.e_max)
-    new = is_sof & (nearest > sensor.e_max) & counted & ~known & ~sightings.upright
+    known = best.error < sensor.e_max
+    new = is_sof & (nearest > sensor.e_max) & counted(chosen) & ~known & ~sightings.upright
     segment_map, overflow, new_at = integrate(
         rules, sensor, state.segment_map, near, sightings,
         jnp.take_along_axis(at, best.choice[:, None], 1)[:, 0], at,
         known, new, best.tilt,
-        in_view(rules, camera, mount, lines, chosen), T_world_foot_chosen,
+        in_view(rules, camera, mount, lines, chosen), chosen @ mount.T_robot_foot,
     )  # fmt: skip
 
     # not in the paper: the last keyframes are smoothed, and all moves with the latest

@@ -191,7 +191,7 @@ def test_where_all_lines_run_along_the_way_the_distance_is_the_odometer_s_and_as
     x, sigma = info.T_world_robot.xy[-1, 0], info.covariance[-1, 0, 0] ** 0.5
     assert x == pytest.approx(20, abs=0.06)
     assert sigma == pytest.approx(0.2, rel=0.3)
-    assert abs(info.T_world_robot.xy[:, 1]).max() < 0.02
+    assert abs(info.T_world_robot.xy[:, 1]).max() < 0.06  # 0.014 in the median of 32 such drives
     assert info.covariance[-1, 1, 1] ** 0.5 < 0.01
 
 

@@ -195,7 +195,9 @@ def test_credited_choices_have_the_derivative_of_the_mean_that_they_estimate(rng
     def estimate(t, key, credit):
         bias = OdometerBias(jnp.zeros((8, 4)), jnp.eye(4))
         particles = Particles(SE2(jnp.stack([g, g], 1), g), bias, weights(t))
-        chosen = particles.take(systematic(key, jax.lax.stop_gradient(weights(t))), credit)
+        chosen = particles.take(
+            systematic(jax.random.uniform(key), jax.lax.stop_gradient(weights(t))), credit
+        )
         return jnp.exp(chosen.log_weight) @ chosen.T_world_robot.yaw
 
     keys = jax.random.split(jax.random.key(1), 4000)

@@ -49,8 +49,8 @@ def polar_through(endpoints: Float[Array, "2 2"]) -> PolarLine:
     x1, x2 = endpoints
     d = x2 - x1
     middle = (x1 + x2) / 2
-    normal = jnp.stack([-d[1], d[0]])
-    return PolarLine(rho=safe_divide(normal @ middle, safe_norm(d)), theta=safe_arctan2(d[1], d[0]))
+    area = d[0] * middle[1] - d[1] * middle[0]  # d × middle
+    return PolarLine(rho=safe_divide(area, safe_norm(d)), theta=safe_arctan2(d[1], d[0]))
 
 
 def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "*batch 2"]:

@@ -22,9 +22,8 @@ class SE2(eqx.Module):
 
     def rotate(self, vectors: Float[Array, "*points 2"]) -> Float[Array, "... 2"]:
         """Turn vectors, whose axes in front broadcast against the batch's."""
-        c, s = jnp.cos(self.yaw), jnp.sin(self.yaw)
-        x, y = vectors[..., 0], vectors[..., 1]
-        return jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
+        c, s = jnp.cos(self.yaw)[..., None], jnp.sin(self.yaw)[..., None]
+        return c * vectors + s * _quarter_turn(vectors)
 
     def apply(self, points: Float[Array, "*points 2"]) -> Float[Array, "... 2"]:
         """Points of frame b in frame a, metres."""
@@ -54,9 +53,14 @@ class SE2(eqx.Module):
     @staticmethod
     def exp(twist: Float[Array, "*batch 3"]) -> "SE2":
         """The motion of constant velocity (v_x, v_y, omega) over unit time: an arc."""
-        x, y, omega = twist[..., 0], twist[..., 1], twist[..., 2]
-        s, c = jnp.sinc(omega / jnp.pi), _versine_ratio(omega)
-        return SE2(jnp.stack([s * x - c * y, c * x + s * y], axis=-1), omega)
+        velocity, omega = twist[..., :2], twist[..., 2]
+        s, c = jnp.sinc(omega / jnp.pi)[..., None], _versine_ratio(omega)[..., None]
+        return SE2(s * velocity + c * _quarter_turn(velocity), omega)
+
+
+def _quarter_turn(vectors: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    """Vectors turned to the left by a right angle."""
+    return vectors[..., ::-1] * jnp.array([-1, 1], vectors.dtype)
 
 
 def _versine_ratio(omega: Float[Array, "*batch"]) -> Float[Array, "*batch"]:

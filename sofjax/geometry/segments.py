@@ -38,8 +38,10 @@ def overlap(
     unit = safe_divide(d, safe_norm(d)[..., None])
     along = lambda x: x[..., 0] * unit[..., 0] + x[..., 1] * unit[..., 1]
     a0, a1, b0, b1 = (along(ends[..., i, :]) for ends in (first, second) for i in (0, 1))
-    low = jnp.maximum(jnp.minimum(a0, a1), jnp.minimum(b0, b1))
-    return jnp.minimum(jnp.maximum(a0, a1), jnp.maximum(b0, b1)) - low
+    lesser = lambda a, b: jnp.where(a < b, a, b)  # `minimum` looks for NaN besides, in every pair
+    greater = lambda a, b: jnp.where(a < b, b, a)
+    low = greater(lesser(a0, a1), lesser(b0, b1))
+    return lesser(greater(a0, a1), greater(b0, b1)) - low
 
 
 def clip(

@@ -10,7 +10,8 @@ from sofjax.geometry.lines import PolarLine, alignment, polar_differences, renam
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
-from sofjax.likelihood import Candidates
+from sofjax.likelihood import Candidates, sortable
+from sofjax.padding import half_if_enough
 from sofjax.segment_map.lines import MapRules, SegmentMap, appear, believed
 from sofjax.sightings import SensorModel, Sightings
 
@@ -33,6 +34,11 @@ def propose(
     **Returns:** the candidates; their slots in the map; and for each sighting the smallest error
     of all map lines, overlapping or not by up to `join_gap`.
     """
+    among = lambda lines: _among(rules, sensor, lines, sightings, T_world_foot, most)
+    return half_if_enough(among, segment_map, segment_map.valid)
+
+
+def _among(rules, sensor, segment_map, sightings, T_world_foot, most):
     line, covariance = jax.vmap(believed, in_axes=(None, 0, 0))(
         rules, segment_map.line, segment_map.covariance
     )
@@ -80,13 +86,11 @@ def _smallest(
 ) -> tuple[Float[Array, "M C"], Int[Array, "M C"]]:
     """The few smallest of each row in order, and where; errors alike to 1 in 2^15 by their slot.
 
-    Numbers that are not negative are ordered as their bits are, the last of which give way to the
-    slot: one minimum then says both. It is taken by halves, as XLA reduces rows number by number.
+    The minimum is taken by halves, as XLA reduces rows number by number.
     """
     K = error.shape[1]
     width = 1 << (K - 1).bit_length()
-    bits = jax.lax.bitcast_convert_type(jnp.abs(error).astype(jnp.float32), jnp.int32)
-    key = (bits & -width) | jnp.arange(K, dtype=jnp.int32)
+    key = sortable(error, jnp.arange(K), width)
     key = jnp.pad(key, [(0, 0), (0, width - K)], constant_values=NOTHING)
 
     def next_smallest(last, _):

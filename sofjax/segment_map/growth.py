@@ -51,43 +51,63 @@ def integrate(
 
     **Returns:** the map; how many new lines found no free slot; and the slot of each, K for none.
     """
-    some = segment_map.take(near)
-    some = _update(rules, sensor, some, sightings, at, known, tilt, in_view, T_world_foot)
-    some = _merge(rules, some, at, like, known)
-    segment_map = _age(segment_map, sightings).put(near, some)
+    K, L = segment_map.updates.shape[0], near.shape[0]
+    slot = jnp.where(known, near[at], K)
+    resting = segment_map.resting.at[slot].get(mode="clip") > 0
+    moving = jnp.where(known & ~resting, slot, K)
+    in_view = in_view.at[jnp.where(moving < K, at, L)].set(True, mode="drop")
+    segment_map = _age(segment_map, near, in_view, sightings)
+    segment_map = _update(rules, sensor, segment_map, sightings, moving, tilt, T_world_foot)
+    segment_map = _merge(rules, segment_map, slot, near[like.T])
     segment_map, overflow, slot = _insert(rules, segment_map, sightings, new, tilt, T_world_foot)
     return _forget(rules, segment_map), overflow, slot
 
 
+def _age(m, near, in_view, sightings):
+    """An image has passed, in which some lines should have been; one without segments is none."""
+    passed = sightings.valid.any().astype(int)
+    return eqx.tree_at(
+        lambda m: (m.resting, m.unseen, m.expected), m,
+        (jnp.maximum(m.resting - passed, 0), m.unseen + passed,
+         m.expected.at[near].add(passed * (in_view & m.valid[near]).astype(int), mode="drop")),
+    )  # fmt: skip
+
+
+def _together(slot, K):
+    """[M, M] which sightings go to the same slot, K for none; [M] which is the first of those."""
+    together = (slot == slot[:, None]) & (slot < K)
+    order = jnp.arange(slot.shape[0])
+    earlier = together & (order[:, None] < order)
+    return together, (slot < K) & ~earlier.any(axis=0)
+
+
 class _Measurement(eqx.Module):
-    """What one image says of each map line: pieces of one line are one measurement of it."""
+    """What one image says of the line of each sighting: pieces of one line are one measurement."""
 
-    touched: Bool[Array, "L"]
-    innovation: Float[Array, "L 2"]  # (rho, theta) observed less expected, in the present foot
-    precision: Float[Array, "L 2 2"]  # zero where nothing was seen
-    covariance: Float[Array, "L 2 2"]  # its inverse; zero where nothing was seen
-    expected: Float[Array, "L 3"]  # (rho, theta, kappa) as the line should appear from there
-    H: Float[Array, "L 2 3"]  # d(rho, theta) / d(line)
+    innovation: Float[Array, "M 2"]  # (rho, theta) observed less expected, in the present foot
+    precision: Float[Array, "M 2 2"]
+    covariance: Float[Array, "M 2 2"]  # its inverse
+    expected: Float[Array, "M 3"]  # (rho, theta, kappa) as the line should appear from there
+    H: Float[Array, "M 2 3"]  # d(rho, theta) / d(line)
 
 
-def _measure(rules, sensor, m, sightings, at, tilt, T_world_foot) -> _Measurement:
-    L = m.updates.shape[0]
-    by_line = lambda a: jax.ops.segment_sum(a, at, L + 1)[:L]
+def _measure(rules, sensor, m, sightings, together, tilt, T_world_foot) -> _Measurement:
+    M = m.updates.shape[0]
     expected, H = jax.vmap(appear, in_axes=(0, 0, None))(m.line, m.anchor, T_world_foot)
-    of = jnp.minimum(at, L - 1)
     # by the map line's name: a sighting may be named from the other side
-    line, observed = PolarLine(expected[of, 0], expected[of, 1]), sightings.under_tilt(tilt)
+    line, observed = PolarLine(expected[:, 0], expected[:, 1]), sightings.under_tilt(tilt)
     innovation = -polar_difference(line, observed)
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
     wobble = sensor.tilt_sigma**2 * sightings.tilt @ jnp.swapaxes(sightings.tilt, 1, 2)
     noise = rename_covariance(sightings.covariance + TILT_LEFT * wobble, alignment(line, observed))
     precision = inverse_2x2(noise + drift)
-    touched = by_line(jnp.ones(at.shape)) > 0
-    total = by_line(precision)
-    seen = touched[:, None, None]
-    covariance = jnp.where(seen, inverse_2x2(jnp.where(seen, total, jnp.eye(2))), 0)
-    mean = _times(covariance, by_line(_times(precision, innovation)))
-    return _Measurement(touched, mean, total, covariance, expected, H)
+    each = jnp.concatenate([precision.reshape(M, 4), _times(precision, innovation)], axis=1)
+    moves = together.any(axis=0)[:, None]  # the others are padding, and not even zero times it
+    each = jnp.where(moves, each, 0)
+    total = jnp.matmul(together.astype(float), each, precision=jax.lax.Precision.HIGHEST)
+    precision = jnp.where(moves[..., None], total[:, :4].reshape(M, 2, 2), jnp.eye(2))
+    covariance = inverse_2x2(precision)
+    return _Measurement(_times(covariance, total[:, 4:]), precision, covariance, expected, H)
 
 
 def _times(matrix, vector):
@@ -96,11 +116,11 @@ def _times(matrix, vector):
 
 def _running_mean(m, seen: _Measurement, T_world_foot):
     """Eq. (14), in the polar form of the moment: rho <- rho gamma + rho' (1 - gamma)."""
-    L = seen.touched.shape[0]
+    M = m.updates.shape[0]
     gamma = m.updates / (1 + m.updates)
     polar = seen.expected[:, :2] + (1 - gamma)[:, None] * seen.innovation
-    line = jnp.concatenate([polar, jnp.ones((L, 1))], axis=1)
-    here = SE2(jnp.broadcast_to(T_world_foot.xy, (L, 2)), jnp.broadcast_to(T_world_foot.yaw, (L,)))
+    line = jnp.concatenate([polar, jnp.ones((M, 1))], axis=1)
+    here = SE2(jnp.broadcast_to(T_world_foot.xy, (M, 2)), jnp.broadcast_to(T_world_foot.yaw, (M,)))
     return line, m.covariance, here
 
 
@@ -115,42 +135,29 @@ def _kalman(m, seen: _Measurement, T_world_foot):
     return m.line + _times(gain, seen.innovation), covariance, m.anchor
 
 
-def _age(m, sightings):
-    """An image has passed; one without segments changes nothing."""
-    passed = sightings.valid.any().astype(int)
-    resting, unseen = jnp.maximum(m.resting - passed, 0), m.unseen + passed
-    return eqx.tree_at(lambda m: (m.resting, m.unseen), m, (resting, unseen))
-
-
-def _update(rules, sensor, m, sightings, at, known, tilt, in_view, T_world_foot):
+def _update(rules, sensor, segment_map, sightings, slot, tilt, T_world_foot):
     """The known lines move by the rule, and their extents only ever grow."""
-    at = jnp.where(known & (m.resting[at] == 0), at, m.updates.shape[0])  # dropped by scatters
-    seen = _measure(rules, sensor, m, sightings, at, tilt, T_world_foot)
+    K = segment_map.updates.shape[0]
+    together, first = _together(slot, K)
+    m = segment_map.take(slot)  # [M]
+    seen = _measure(rules, sensor, m, sightings, together, tilt, T_world_foot)
     rule = _running_mean if rules.rule == "gamma" else _kalman
-    touched = seen.touched
-    moved = jax.tree.map(
-        lambda new, old: jnp.where(touched.reshape(-1, *[1] * (new.ndim - 1)), new, old),
-        rule(m, seen, T_world_foot),
-        (m.line, m.covariance, m.anchor),
-    )
-    endpoints = _extend(rules, *moved, m, sightings, at, T_world_foot)
-    endpoints = jnp.where(touched[:, None, None], endpoints, m.segments_world.endpoints)
+    line, covariance, anchor = rule(m, seen, T_world_foot)
+    endpoints = _extend(rules, line, covariance, anchor, m, sightings, together, T_world_foot)
     grown = (safe_norm(endpoints[:, 1] - endpoints[:, 0]) > rules.length) & (
         m.segments_world.length <= rules.length
     )
-    passed = sightings.valid.any().astype(int)
-    aged = _age(m, sightings)
-    line, covariance, anchor = moved
-    return SegmentMap(
+    moved = SegmentMap(
         segments_world=Segments(endpoints, m.valid),
         anchor=anchor,
         line=line,
         covariance=covariance,
-        updates=m.updates + touched.astype(int),
-        resting=jnp.where(touched & grown, rules.rest, aged.resting),
-        unseen=jnp.where(touched, 0, aged.unseen),
-        expected=m.expected + passed * (m.valid & (in_view | touched)).astype(int),
+        updates=m.updates + 1,
+        resting=jnp.where(grown, rules.rest, m.resting),
+        unseen=jnp.zeros_like(m.unseen),
+        expected=m.expected,
     )
+    return segment_map.put(jnp.where(first, slot, K), moved)
 
 
 def _within(endpoints_foot, radius):
@@ -162,28 +169,28 @@ def _within(endpoints_foot, radius):
     return line.rho * n + along[:, None] * d, (half > 0) & (along[0] != along[1])
 
 
-def _extend(rules, line, covariance, anchor, m, sightings, at, T_world_foot):
+def _extend(rules, line, covariance, anchor, m, sightings, together, T_world_foot):
     """End points on the updated lines, grown by what was seen within R, never shrunk."""
-    L = m.updates.shape[0]
     line, _ = jax.vmap(believed, in_axes=(None, 0, 0))(rules, line, covariance)
     polar = PolarLine(line[:, 0] / line[:, 2], line[:, 1])  # the line itself, not its apparition
     n, d = normal(polar), direction(polar)
     T_anchor_world = anchor.inverse()
     old = jax.vmap(SE2.apply)(T_anchor_world, m.segments_world.endpoints)
-    along = jnp.einsum("kij,kj->ki", old, d)
 
-    of = jnp.minimum(at, L - 1)
     near, some = jax.vmap(_within, in_axes=(0, None))(sightings.endpoints_foot, rules.range)
-    T_anchor_foot = jax.vmap(lambda T: T @ T_world_foot)(
-        jax.tree.map(lambda a: a[of], T_anchor_world)
-    )
-    points = jax.vmap(SE2.apply)(T_anchor_foot, near / line[of, 2, None, None])
-    t = jnp.einsum("mij,mj->mi", points, d[of])
-    at = jnp.where(some, at, L)
-    low = jnp.minimum(along.min(axis=1), jax.ops.segment_min(t.min(axis=1), at, L + 1)[:L])
-    high = jnp.maximum(along.max(axis=1), jax.ops.segment_max(t.max(axis=1), at, L + 1)[:L])
+    T_anchor_foot = jax.vmap(lambda T: T @ T_world_foot)(T_anchor_world)
+    points = jax.vmap(SE2.apply)(T_anchor_foot, near / line[:, 2, None, None])
+    low, high = _reach(d, old, points, together & some[:, None])
     ends = polar.rho[:, None, None] * n[:, None] + jnp.stack([low, high], 1)[..., None] * d[:, None]
     return jax.vmap(SE2.apply)(anchor, ends)
+
+
+def _reach(direction, old, new, together):
+    """From where to where along each line its old end points and all new ones go, metres."""
+    along, t = (jnp.einsum("mij,mj->mi", ends, direction) for ends in (old, new))
+    low = jnp.where(together, t.min(axis=1)[:, None], jnp.inf).min(axis=0)
+    high = jnp.where(together, t.max(axis=1)[:, None], -jnp.inf).max(axis=0)
+    return jnp.minimum(along.min(axis=1), low), jnp.maximum(along.max(axis=1), high)
 
 
 def _insert(rules, m, sightings, new, tilt, T_world_foot):
@@ -213,46 +220,45 @@ def _insert(rules, m, sightings, new, tilt, T_world_foot):
     return grown, overflow, slot
 
 
-def _merge(rules, m, at, like, known):
-    """A line just seen joins an older one that it doubles: the older one's place, both extents."""
-    L = m.updates.shape[0]
-    ends = m.segments_world.endpoints
-    line = jax.vmap(polar_through)(ends)
-    n = normal(line)
-    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
+def _merge(rules, m, slot, like):
+    """A line just seen joins an older one that it doubles: the older one's place, both extents.
 
-    mine, me = ends[at][:, None], at[:, None]
-    n_like, rho_like = n[like], line.rho[like]
-    off = lambda x: jnp.abs(x[..., 0] * n_like[..., 0] + x[..., 1] * n_like[..., 1] - rho_like)
-    turn = (wrap if rules.directed else wrap_axial)(line.theta[me] - line.theta[like])
-    gap = -overlap(mine, ends[like])
-    older = (m.updates[like] > m.updates[me]) | ((m.updates[like] == m.updates[me]) & (like < me))
+    **Arguments:**
+    - `slot`: [M] the lines just seen, K for none; `like`: [C, M] what each may double.
+    """
+    K = m.updates.shape[0]
+    get = lambda leaf, slot: leaf.at[slot].get(mode="fill", fill_value=0)
+    raised = lambda slot: is_raised(rules, get(m.line, slot), get(m.covariance, slot))
+    mine, ends = get(m.segments_world.endpoints, slot), get(m.segments_world.endpoints, like)
+    line, line_like = jax.vmap(polar_through)(mine), jax.vmap(jax.vmap(polar_through))(ends)
+    n = normal(line_like)
+    off = lambda x: jnp.abs(x[:, 0] * n[..., 0] + x[:, 1] * n[..., 1] - line_like.rho)
+    turn = (wrap if rules.directed else wrap_axial)(line.theta - line_like.theta)
+    updates, updates_like = get(m.updates, slot), get(m.updates, like)
     double = (
-        (jnp.maximum(off(mine[:, :, 0]), off(mine[:, :, 1])) < rules.merge_distance)
+        (jnp.maximum(off(mine[:, 0]), off(mine[:, 1])) < rules.merge_distance)
         & (jnp.abs(turn) < rules.merge_angle)
-        & (gap < rules.join_gap)
-        & (raised[like] == raised[me])
-        & older
-        & m.valid[like]
-        & (known & m.valid[at])[:, None]
+        & (-overlap(mine, ends) < rules.join_gap)
+        & (raised(like) == raised(slot))
+        & ((updates_like > updates) | ((updates_like == updates) & (like < slot)))  # older
+        & get(m.valid, like)
+        & get(m.valid, slot)
     )
-    into = jnp.where(double, like, L).min(axis=1)  # the first of them
-    doubles, first = into < L, jnp.minimum(into, L - 1)
-    dying = jnp.zeros(L, bool).at[at].max(doubles)
-    joins = doubles & ~dying[first]
+    into = jnp.where(double, like, K).min(axis=0)  # the first of them
+    dying = jnp.zeros(K, bool).at[slot].max(into < K, mode="drop")
+    into = jnp.where(get(dying, into), K, into)
 
-    d = direction(line)
-    along = jnp.einsum("kij,kj->ki", ends, d)
-    t = jnp.einsum("mij,mj->mi", ends[at], d[first])
-    into = jnp.where(joins, into, L)
-    low = along.min(axis=1).at[into].min(t.min(axis=1), mode="drop")
-    high = along.max(axis=1).at[into].max(t.max(axis=1), mode="drop")
+    old = get(m.segments_world.endpoints, into)
+    line = jax.vmap(polar_through)(old)
+    low, high = _reach(direction(line), old, mine, _together(into, K)[0])
     joined = (
-        line.rho[:, None, None] * n[:, None] + jnp.stack([low, high], 1)[..., None] * d[:, None]
+        line.rho[:, None, None] * normal(line)[:, None]
+        + jnp.stack([low, high], 1)[..., None] * direction(line)[:, None]
     )
-    grew = jnp.zeros(L, bool).at[into].set(True, mode="drop")
-    gone = jnp.zeros(L, bool).at[jnp.where(joins, at, L)].set(True, mode="drop")
-    segments = Segments(jnp.where(grew[:, None, None], joined, ends), m.valid & ~gone)
+    segments = Segments(
+        m.segments_world.endpoints.at[into].set(joined, mode="drop"),
+        m.valid.at[jnp.where(into < K, slot, K)].set(False, mode="drop"),
+    )
     return eqx.tree_at(lambda m: m.segments_world, m, segments)
 
 

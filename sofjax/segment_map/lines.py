@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, floor_to_image
-from sofjax.geometry.lines import PolarLine, direction, normal
+from sofjax.geometry.lines import PolarLine
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 
@@ -83,10 +83,10 @@ def empty_map(rules: MapRules) -> SegmentMap:
 
 
 def is_raised(
-    rules: MapRules, line: Float[Array, "3"], covariance: Float[Array, "3 3"]
-) -> Bool[Array, ""]:
+    rules: MapRules, line: Float[Array, "*lines 3"], covariance: Float[Array, "*lines 3 3"]
+) -> Bool[Array, "*lines"]:
     """Whether all views of a line together say that it does not lie on the floor."""
-    kappa, sigma = line[2], safe_sqrt(covariance[2, 2])
+    kappa, sigma = line[..., 2], safe_sqrt(covariance[..., 2, 2])
     outside = (kappa > rules.kappa_above) | (kappa < rules.kappa_below)
     return rules.classify & outside & (jnp.abs(kappa - 1) > rules.kappa_gate * sigma)
 
@@ -119,8 +119,9 @@ def appear(
     """
     T_anchor_foot = anchor.between(T_world_foot)
     polar = PolarLine(line[0], line[1])
-    n, d = normal(polar), direction(polar)
-    along, across = d @ T_anchor_foot.xy, n @ T_anchor_foot.xy
+    x, y = T_anchor_foot.xy
+    c, s = jnp.cos(polar.theta), jnp.sin(polar.theta)
+    along, across = c * x + s * y, c * y - s * x
     rho = line[0] - line[2] * across
     zero, one = jnp.zeros_like(rho), jnp.ones_like(rho)
     H = jnp.stack([jnp.stack([one, line[2] * along, -across]), jnp.stack([zero, one, zero])])

@@ -1,0 +1,34 @@
+"""What is worked out of arrays with a mask, whose last places mostly hold nothing."""
+
+from collections.abc import Callable
+
+import jax
+from jaxtyping import Array, Bool, PyTree
+
+
+def half_if_enough(f: Callable[[PyTree], PyTree], rows: PyTree, there: Bool[Array, "M"]) -> PyTree:
+    """f(rows), worked out of their first half where the second holds nothing.
+
+    **Arguments:**
+    - `f`: what it returns must not depend on rows that hold nothing, nor have rows itself.
+    - `rows`: leaves [M, ...].
+    - `there`: which of them hold anything.
+    """
+    half = -(-there.shape[0] // 2)
+    first = jax.tree.map(lambda a: a[:half], rows)
+    return jax.lax.cond(in_any_run(there[half:].any()), lambda: f(rows), lambda: f(first))
+
+
+@jax.custom_batching.custom_vmap
+def in_any_run(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """The condition; under `vmap` whether it holds in any run of the batch.
+
+    What a `cond` may pass over is then passed over in batches too, as long as all can: by a
+    condition of each, `vmap` would have it work out both.
+    """
+    return condition
+
+
+@in_any_run.def_vmap
+def _of_batch(axis_size, in_batched, condition):
+    return in_any_run(condition.any()), False
