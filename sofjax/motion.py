@@ -109,7 +109,8 @@ def sample_motion(
     covariance = bias.covariance + wander
     S = A @ covariance @ A.T + noise  # diagonal: distance and turn share no error
     sigma = safe_sqrt(jnp.diag(S))
-    # one draw for all: a key for each particle costs more than the rest of this
+    # one draw for all: a key for each particle costs more than the rest of this; the particles last
+    # and by a product of matrices, as XLA would otherwise draw anew for whoever asks
     draw = jax.random.normal(key, (3, *bias.mean.shape[:-1]))
     sigmas = jnp.append(sigma, model.lateral_noise * safe_sqrt(distance))
     noise = jnp.tensordot(draw, jnp.diag(sigmas), axes=(0, 0))
