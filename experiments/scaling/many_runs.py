@@ -39,8 +39,8 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
     """Seconds of one call for many seeds of the filter, and of a call for each, alternating.
 
     Every core is a device of its own: runs have nothing to tell each other, so that each device
-    takes its share of them. The calls one by one are those of a user: one device, which is free to
-    use all cores.
+    takes its share of them. The calls one by one are those of the front page, `slam.init` and
+    `slam.run`: one device, which is free to use all cores.
     """
     drive = common.random_drive("random", seed, images)
     log = trimmed(drive.observations)
@@ -57,7 +57,6 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
 
     mesh = jax.make_mesh((len(jax.devices()),), ("runs",), axis_types=(AxisType.Auto,))
     copied, shared = PartitionSpec(), PartitionSpec("runs")
-    alone = jax.jit(run)
     on_all_devices = jax.jit(
         jax.shard_map(
             share, mesh=mesh, in_specs=(copied, shared), out_specs=shared, check_vma=False
@@ -73,8 +72,8 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
         jax.block_until_ready(call())
         return time.process_time() - c, time.perf_counter() - w
 
-    calls = lambda: [jax.block_until_ready(alone(log, key)) for key in keys]
-    compiling = {"one": timed(lambda: alone(log, keys[0])), "many": timed(together)}
+    calls = lambda: [jax.block_until_ready(run(log, key)) for key in keys]
+    compiling = {"one": timed(lambda: run(log, keys[0])), "many": timed(together)}
     one, many = np.median([(timed(calls), timed(together))
                            for _ in range(rounds)], axis=0)  # fmt: skip
     return {
