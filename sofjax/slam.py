@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sofjax.association import Association, gate_probability
-from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
@@ -29,7 +28,6 @@ from sofjax.segment_map import (
     empty_map,
     in_view,
     integrate,
-    is_raised,
     nearby,
     propose,
 )
@@ -345,33 +343,3 @@ def _log_density(config, camera, sightings, candidates, T_predicted_foot, floor,
         config.sensor, sightings, candidates, T_predicted_foot, known, lines, elsewhere
     )
     return of_used + unused.astype(float) * elsewhere
-
-
-class FinalMap(eqx.Module):
-    """What the map says in the end."""
-
-    endpoints_world: Float[Array, "K 2 2"]  # metres
-    is_floor: Bool[Array, "K"]  # the segments on the floor; all else is not part of the map
-    updates: Int[Array, "K"]  # how often each was seen
-    height: Float[Array, "K"]  # metres above the floor, by the views of the line
-    height_sigma: Float[Array, "K"]  # metres
-
-
-def final_map(config: SlamConfig, mount: Mount, segment_map: SegmentMap) -> FinalMap:
-    """The segments seen often enough that do not stand above the floor."""
-    rules = config.segment_map
-    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(
-        rules, segment_map.line, segment_map.covariance
-    )
-    often = segment_map.updates >= rules.min_updates
-    kappa, sigma = segment_map.line[:, 2], safe_sqrt(segment_map.covariance[:, 2, 2])
-    known = ~jnp.asarray(rules.classify) | (sigma < rules.kappa_known)
-    updates, expected = segment_map.updates.astype(float), segment_map.expected.astype(float)
-    shown = updates >= rules.min_share * expected
-    return FinalMap(
-        endpoints_world=segment_map.segments_world.endpoints,
-        is_floor=segment_map.valid & often & shown & known & ~raised,
-        updates=segment_map.updates,
-        height=mount.height * (1 - 1 / kappa),
-        height_sigma=mount.height * sigma / kappa**2,
-    )

@@ -146,7 +146,7 @@ def _solve(rules, map_rules, sensor, model, window, segment_map, T_robot_foot, f
     )
     known = _learned(known, lines.line, linear(*oldest, lines.line))
 
-    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(map_rules, lines.line, lines.covariance)
+    raised = is_raised(map_rules, lines.line, lines.covariance)
     line = lines.line.at[:, 2].set(jnp.where(raised, lines.line[:, 2], 1))
     floor = jnp.where(raised, 0, FLOOR)
     first = jnp.maximum(W - count, 0)  # it holds its pose, as do those that are none yet

@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sofjax import loop_closure, slam, smoothing
+from sofjax import loop_closure, smoothing
 from sofjax.cli import outputs
 from sofjax.cli.settings import RunSettings
 from sofjax.cli.tally import Closed, Tally
 from sofjax.evaluation import align
 from sofjax.io.drive import Drive
 from sofjax.io.trajectory import Trajectory, write_trajectory
+from sofjax.segment_map import final_map
 from sofjax.slam import SlamState
 
 # where a user says that the drive ends as a loop: the share of lines that must fit, and the lead
@@ -111,7 +112,9 @@ def _smooth(drive, settings, tally, log, path, state) -> Closed:
 def _by_the_paper(drive, settings, tally, log, path, state) -> Closed | None:
     """The error at the end, spread evenly back along the path; nothing if no loop is found."""
     mount = drive.camera_file.mount
-    final = jax.device_get(eqx.filter_jit(slam.final_map)(settings.slam, mount, state.segment_map))
+    final = jax.device_get(
+        eqx.filter_jit(final_map)(settings.slam.segment_map, mount, state.segment_map)
+    )
     known = loop_closure.driven(path, mount, state.segment_map, final)
     last = np.array([len(tally.stamps) - 1])
     asked = loop_closure.revisits(TOLD, known, last)

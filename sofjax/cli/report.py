@@ -29,6 +29,7 @@ from sofjax.io.drive import Drive, outside
 from sofjax.io.errors import InputError
 from sofjax.io.map_file import write_map
 from sofjax.io.settings import to_dict
+from sofjax.segment_map import final_map
 
 UNHELD = 5.0  # metres; R, within which a line across the way is mapped and holds the distance
 PACKAGES = ("sofjax", "jax", "jaxlib", "equinox", "numpy", "opencv-python-headless")
@@ -64,9 +65,10 @@ def write_results(
     if state is not None:
         if closed is None:
             # one compilation for all its small operations
-            final_map = eqx.filter_jit(slam.final_map)
             mount = drive.camera_file.mount
-            final = jax.device_get(final_map(settings.slam, mount, state.segment_map))
+            final = jax.device_get(
+                eqx.filter_jit(final_map)(settings.slam.segment_map, mount, state.segment_map)
+            )
             lines = np.asarray(state.segment_map.valid).sum()
         else:
             final, lines = closed.final, closed.report["lines"]

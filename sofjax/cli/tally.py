@@ -11,7 +11,8 @@ from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory
 from sofjax.observation import Observation
-from sofjax.slam import FinalMap, StepInfo
+from sofjax.segment_map import FinalMap
+from sofjax.slam import StepInfo
 from sofjax.vision import View
 
 WARM = 10  # images that timing leaves out: the first one compiles

@@ -9,8 +9,8 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.loop_closure.constellation import ClosingRules
 from sofjax.loop_closure.revisits import Revisit, closed, joined_map, revisits, solved
 from sofjax.observation import Observation
-from sofjax.segment_map import SegmentMap
-from sofjax.slam import FinalMap, SlamConfig
+from sofjax.segment_map import FinalMap, SegmentMap
+from sofjax.slam import SlamConfig
 from sofjax.smoothing import Path, Smoothed, SmoothingRules, final_map, smooth
 
 DEFAULT, CLOSING = SmoothingRules(), ClosingRules()

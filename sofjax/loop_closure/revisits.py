@@ -11,8 +11,7 @@ from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 from sofjax.loop_closure.constellation import Closing, ClosingRules, find
 from sofjax.loop_closure.spreading import distribute
-from sofjax.segment_map import SegmentMap
-from sofjax.slam import FinalMap
+from sofjax.segment_map import FinalMap, SegmentMap
 from sofjax.smoothing import Path, Smoothed
 
 WINDOW = 6.0  # metres of the way whose new lines are looked for together

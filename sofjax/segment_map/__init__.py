@@ -7,6 +7,8 @@ anchor the first sighting is the estimate itself. kappa = h / (h - z) is its app
 """
 
 from sofjax.segment_map.candidates import propose as propose
+from sofjax.segment_map.final import FinalMap as FinalMap
+from sofjax.segment_map.final import final_map as final_map
 from sofjax.segment_map.growth import integrate as integrate
 from sofjax.segment_map.lines import MapRules as MapRules
 from sofjax.segment_map.lines import SegmentMap as SegmentMap

@@ -74,11 +74,8 @@ def _age(m, near, in_view, sightings):
 
 
 def _together(slot, K):
-    """[M, M] which sightings go to the same slot, K for none; [M] which is the first of those."""
-    together = (slot == slot[:, None]) & (slot < K)
-    order = jnp.arange(slot.shape[0])
-    earlier = together & (order[:, None] < order)
-    return together, (slot < K) & ~earlier.any(axis=0)
+    """[M, M] Which sightings go to the same slot; K for none."""
+    return (slot == slot[:, None]) & (slot < K)
 
 
 class _Measurement(eqx.Module):
@@ -138,7 +135,7 @@ def _kalman(m, seen: _Measurement, T_world_foot):
 def _update(rules, sensor, segment_map, sightings, slot, tilt, T_world_foot):
     """The known lines move by the rule, and their extents only ever grow."""
     K = segment_map.updates.shape[0]
-    together, first = _together(slot, K)
+    together = _together(slot, K)
     m = segment_map.take(slot)  # [M]
     seen = _measure(rules, sensor, m, sightings, together, tilt, T_world_foot)
     rule = _running_mean if rules.rule == "gamma" else _kalman
@@ -157,7 +154,9 @@ def _update(rules, sensor, segment_map, sightings, slot, tilt, T_world_foot):
         unseen=jnp.zeros_like(m.unseen),
         expected=m.expected,
     )
-    return segment_map.put(jnp.where(first, slot, K), moved)
+    order = jnp.arange(slot.shape[0])
+    again = (together & (order[:, None] < order)).any(axis=0)  # the first piece stands for all
+    return segment_map.put(jnp.where(again, K, slot), moved)
 
 
 def _within(endpoints_foot, radius):
@@ -173,24 +172,23 @@ def _extend(rules, line, covariance, anchor, m, sightings, together, T_world_foo
     """End points on the updated lines, grown by what was seen within R, never shrunk."""
     line, _ = jax.vmap(believed, in_axes=(None, 0, 0))(rules, line, covariance)
     polar = PolarLine(line[:, 0] / line[:, 2], line[:, 1])  # the line itself, not its apparition
-    n, d = normal(polar), direction(polar)
     T_anchor_world = anchor.inverse()
     old = jax.vmap(SE2.apply)(T_anchor_world, m.segments_world.endpoints)
 
     near, some = jax.vmap(_within, in_axes=(0, None))(sightings.endpoints_foot, rules.range)
     T_anchor_foot = jax.vmap(lambda T: T @ T_world_foot)(T_anchor_world)
     points = jax.vmap(SE2.apply)(T_anchor_foot, near / line[:, 2, None, None])
-    low, high = _reach(d, old, points, together & some[:, None])
-    ends = polar.rho[:, None, None] * n[:, None] + jnp.stack([low, high], 1)[..., None] * d[:, None]
-    return jax.vmap(SE2.apply)(anchor, ends)
+    return jax.vmap(SE2.apply)(anchor, _spanned(polar, old, points, together & some[:, None]))
 
 
-def _reach(direction, old, new, together):
-    """From where to where along each line its old end points and all new ones go, metres."""
-    along, t = (jnp.einsum("mij,mj->mi", ends, direction) for ends in (old, new))
+def _spanned(line, old, new, together):
+    """[M, 2, 2] End points on each line that span its old ones and all new ones that go with it."""
+    n, d = normal(line), direction(line)
+    along, t = (jnp.einsum("mij,mj->mi", ends, d) for ends in (old, new))
     low = jnp.where(together, t.min(axis=1)[:, None], jnp.inf).min(axis=0)
     high = jnp.where(together, t.max(axis=1)[:, None], -jnp.inf).max(axis=0)
-    return jnp.minimum(along.min(axis=1), low), jnp.maximum(along.max(axis=1), high)
+    reach = jnp.minimum(along.min(axis=1), low), jnp.maximum(along.max(axis=1), high)
+    return line.rho[:, None, None] * n[:, None] + jnp.stack(reach, 1)[..., None] * d[:, None]
 
 
 def _insert(rules, m, sightings, new, tilt, T_world_foot):
@@ -249,12 +247,7 @@ def _merge(rules, m, slot, like):
     into = jnp.where(get(dying, into), K, into)
 
     old = get(m.segments_world.endpoints, into)
-    line = jax.vmap(polar_through)(old)
-    low, high = _reach(direction(line), old, mine, _together(into, K)[0])
-    joined = (
-        line.rho[:, None, None] * normal(line)[:, None]
-        + jnp.stack([low, high], 1)[..., None] * direction(line)[:, None]
-    )
+    joined = _spanned(jax.vmap(polar_through)(old), old, mine, _together(into, K))
     segments = Segments(
         m.segments_world.endpoints.at[into].set(joined, mode="drop"),
         m.valid.at[jnp.where(into < K, slot, K)].set(False, mode="drop"),

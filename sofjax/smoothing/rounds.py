@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.observation import Observation
-from sofjax.segment_map import MapRules, SegmentMap, is_raised, on_floor
-from sofjax.slam import FinalMap, SlamConfig
+from sofjax.segment_map import FinalMap, MapRules, SegmentMap, is_raised, on_floor
+from sofjax.slam import SlamConfig
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.dissection import Dissection, dissect, divide
 from sofjax.smoothing.extents import reaches
@@ -193,7 +193,7 @@ def _lines_of_map(rules: MapRules, m: SegmentMap, smoothing: SmoothingRules) -> 
 @jax.jit
 def _chosen(rules, m, slots, count):
     m = jax.tree.map(lambda a: a[slots], m)
-    raised = jax.vmap(is_raised, in_axes=(None, 0, 0))(rules, m.line, m.covariance)
+    raised = is_raised(rules, m.line, m.covariance)
     line = jnp.where(raised[:, None], m.line, jax.vmap(on_floor)(m.line, m.covariance))
     real = jnp.arange(slots.shape[0]) < count
     return lines_of(m.anchor, line, m.segments_world.endpoints, raised, real)
