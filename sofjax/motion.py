@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import ndtri
+from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sofjax.geometry.angles import safe_sqrt
@@ -123,7 +123,7 @@ def sample_motion(
     return SE2.exp(jnp.stack([moved[..., 0], across, moved[..., 1]], axis=-1)), learned
 
 
-SLIPPED = 0.05  # share of the particles that try a slip
+ONE_IN = 20  # of so many particles one tries a slip
 
 
 def sample_slip(
@@ -131,29 +131,33 @@ def sample_slip(
     odometer: SE2,
     testable: Bool[Array, ""],
     key: PRNGKeyArray,
-    shape: tuple[int, ...] = (),
-) -> tuple[SE2, Float[Array, "*shape"]]:
+    count: int,
+) -> tuple[SE2, Float[Array, "N"]]:
     """What particles suppose that the wheels reported and the robot did not do.
 
     Slips are rare and large: many more particles try one than their rate says, and weigh less for
-    it, so that without a sighting that tells nothing changes.
+    it, so that without a sighting that tells nothing changes. Those that try are drawn as
+    systematic resampling draws: one of every 20, the first of them at random.
 
     **Arguments:**
     - `odometer`: T_previous_current as read; a robot that stands does not slip.
-    - `shape`: of the particles.
+    - `count`: N particles.
 
     **Returns:** the motion of each to append to the reading's, mostly none, and the logarithm of
     its importance weight.
     """
-    probability = jnp.minimum(model.slip_rate * jnp.abs(odometer.log()[0]), SLIPPED)
+    probability = jnp.minimum(model.slip_rate * jnp.abs(odometer.log()[0]), 1 / ONE_IN)
     possible = testable & (probability > 0)
-    which, *size = jax.random.normal(key, (3, *shape))  # one draw for all that is random here
-    slips = possible & (which < ndtri(SLIPPED))
-    along, turn = (jnp.asarray(s, float) for s in (model.slip_distance, model.slip_turn))
-    sigmas = jnp.zeros((2, 3)).at[0, 0].set(along).at[1, 2].set(turn)
-    twist = jnp.tensordot(jnp.where(slips, jnp.stack(size), 0), sigmas, axes=(0, 0))
-    probability = jnp.where(possible, probability, SLIPPED)
-    log_weight = jnp.where(
-        slips, jnp.log(probability / SLIPPED), jnp.log1p(-probability) - jnp.log1p(-SLIPPED)
-    )
-    return SE2.exp(twist), jnp.where(possible, log_weight, 0)
+    trying = -(-count // ONE_IN)
+    drawn = jax.random.normal(key, (1 + 2 * trying,))
+    first = (ONE_IN * ndtr(drawn[0])).astype(int)
+    tries = first + ONE_IN * jnp.arange(trying)
+    along, turn = drawn[1:].reshape(2, trying)
+    along, turn = model.slip_distance * along, model.slip_turn * turn
+    each = SE2.exp(jnp.stack([along, jnp.zeros(trying), turn], axis=-1))
+    each = jnp.where(possible, jnp.concatenate([each.xy, each.yaw[:, None]], axis=1), 0)
+    slip = jnp.zeros((count, 3)).at[tries].set(each, mode="drop")
+    probability = jnp.where(possible, probability, 1 / ONE_IN)
+    log_weight = jnp.full(count, jnp.log1p(-probability) - jnp.log1p(-1 / ONE_IN))
+    log_weight = log_weight.at[tries].set(jnp.log(probability * ONE_IN), mode="drop")
+    return SE2(slip[:, :2], slip[:, 2]), jnp.where(possible, log_weight, 0)

@@ -159,7 +159,7 @@ def step(
         config.motion, state.particles.bias, observation.motion, key_motion
     )
     slip, log_ratio = sample_slip(
-        config.motion, observation.motion, state.noise < SURE, key_slip, (N,)
+        config.motion, observation.motion, state.noise < SURE, key_slip, N
     )
     unslipped = Particles(state.particles.T_world_robot @ motion, bias, state.particles.log_weight)
     T_world_robot = unslipped.T_world_robot @ slip

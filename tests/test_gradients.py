@@ -316,7 +316,7 @@ def test_gradients_of_a_drawn_motion(twist):
 def slipped(p):
     model = eqx.tree_at(lambda m: (m.slip_distance, m.slip_turn), MotionModel(), (p[3], p[4]))
     # some of them try a slip
-    return sample_slip(model, SE2.exp(p[:3]), jnp.array(True), jax.random.key(0), (100,))
+    return sample_slip(model, SE2.exp(p[:3]), jnp.array(True), jax.random.key(0), 100)
 
 
 @pytest.mark.parametrize("twist", [[0.3, 0.01, 0.2], [0.0, 0.0, 0.0], [0.0, 0.0, 0.1]])

@@ -8,7 +8,7 @@ from conftest import jit_quickly
 
 from sofjax.geometry import SE2
 from sofjax.motion import (
-    SLIPPED,
+    ONE_IN,
     MotionModel,
     OdometerBias,
     prior_bias,
@@ -180,7 +180,7 @@ def test_many_particles_are_each_drawn_from_their_own_belief():
 def slips(model, odometer, testable=True):
     """Twists of N particles, and their importance weights."""
     slip, log_weight = jax.jit(sample_slip, static_argnums=4)(
-        model, odometer, jnp.array(testable), jax.random.key(2), (N,)
+        model, odometer, jnp.array(testable), jax.random.key(2), N
     )
     return np.asarray(slip.log()), np.exp(np.asarray(log_weight))
 
@@ -189,12 +189,19 @@ def test_slips_are_tried_often_and_weigh_as_rarely_as_they_happen():
     model = MotionModel(slip_rate=0.05, slip_distance=0.02, slip_turn=0.1)
     twist, weight = slips(model, reading(0.4, 0, 0.1))
     slipped = twist[:, 2] != 0
-    assert slipped.mean() == pytest.approx(SLIPPED, abs=0.01)
-    assert weight.mean() == pytest.approx(1, abs=0.01)
+    assert slipped.mean() == 1 / ONE_IN
+    assert weight.mean() == pytest.approx(1)
     assert (weight * slipped).mean() == pytest.approx(0.05 * 0.4, rel=0.2)
     assert twist[slipped, 0].std() == pytest.approx(0.02, rel=0.1)
     assert twist[slipped, 2].std() == pytest.approx(0.1, rel=0.1)
     assert (twist[~slipped] == 0).all()
+
+
+def test_each_of_a_few_particles_tries_a_slip_as_often():
+    keys = jax.random.split(jax.random.key(3), 20_000)
+    of_key = lambda key: sample_slip(MotionModel(), reading(0.4, 0, 0), jnp.array(True), key, 27)
+    slip, _ = jax.jit(jax.vmap(of_key))(keys)
+    np.testing.assert_allclose((slip.yaw != 0).mean(axis=0), 1 / ONE_IN, atol=0.006)
 
 
 @pytest.mark.parametrize(
