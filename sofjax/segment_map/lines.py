@@ -11,6 +11,7 @@ from sofjax.geometry.floor import floor_homography, floor_to_image
 from sofjax.geometry.lines import PolarLine
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
+from sofjax.padding import in_any_run
 
 
 class MapRules(eqx.Module):
@@ -153,21 +154,26 @@ def nearby(
     """
     K = segment_map.updates.shape[0]
     L = min(most or rules.nearby, K)
-    ends = segment_map.segments_world.endpoints - T_world_foot.xy
-    x, y = ends[:, 0, 0], ends[:, 0, 1]
-    u, v = ends[:, 1, 0] - x, ends[:, 1, 1] - y
-    share = jnp.clip(-(x * u + y * v) / jnp.maximum(u * u + v * v, 1e-12), 0, 1)
-    # a raised line is seen magnified about the foot
-    distance2 = ((x + share * u) ** 2 + (y + share * v) ** 2) * segment_map.line[:, 2] ** 2
     there = segment_map.valid & (segment_map.unseen <= rules.recall)
-    distance2 = jnp.where(there, distance2, jnp.inf)
-    radii = jnp.append(reach * jnp.arange(1, RUNGS + 1, dtype=float) / RUNGS, jnp.inf)
-    counts = jnp.sum(distance2 < radii[:, None] ** 2, axis=1)
-    radius = jnp.max(jnp.where(counts <= L, radii, 0))
-    near = distance2 < radius**2
+
+    def nearest():
+        ends = segment_map.segments_world.endpoints - T_world_foot.xy
+        x, y = ends[:, 0, 0], ends[:, 0, 1]
+        u, v = ends[:, 1, 0] - x, ends[:, 1, 1] - y
+        share = jnp.clip(-(x * u + y * v) / jnp.maximum(u * u + v * v, 1e-12), 0, 1)
+        # a raised line is seen magnified about the foot
+        distance2 = ((x + share * u) ** 2 + (y + share * v) ** 2) * segment_map.line[:, 2] ** 2
+        distance2 = jnp.where(there, distance2, jnp.inf)
+        radii = jnp.append(reach * jnp.arange(1, RUNGS + 1, dtype=float) / RUNGS, jnp.inf)
+        counts = jnp.sum(distance2 < radii[:, None] ** 2, axis=1)
+        near = distance2 < jnp.max(jnp.where(counts <= L, radii, 0)) ** 2
+        return near, counts[RUNGS - 1] - jnp.minimum(near.sum(), counts[RUNGS - 1])
+
+    everything = lambda: (there, jnp.zeros((), int))
+    near, hidden = jax.lax.cond(in_any_run(there.sum() > L), nearest, everything)
     place = jnp.where(near, jnp.cumsum(near) - 1, L)
     slots = jnp.full(L, K).at[place].set(jnp.arange(K), mode="drop")
-    return slots, counts[RUNGS - 1] - jnp.minimum(near.sum(), counts[RUNGS - 1])
+    return slots, hidden
 
 
 def in_view(
