@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sofjax.geometry.angles import safe_norm, safe_sqrt, wrap, wrap_axial
+from sofjax.geometry.angles import safe_divide, safe_norm, safe_sqrt
 from sofjax.geometry.lines import (
     PolarLine,
     alignment,
@@ -18,6 +18,7 @@ from sofjax.geometry.lines import (
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments, overlap
+from sofjax.padding import in_any_run
 from sofjax.segment_map.lines import MapRules, SegmentMap, appear, believed, is_raised
 from sofjax.sightings import SensorModel, Sightings
 
@@ -228,31 +229,41 @@ def _merge(rules, m, slot, like):
     get = lambda leaf, slot: leaf.at[slot].get(mode="fill", fill_value=0)
     raised = lambda slot: is_raised(rules, get(m.line, slot), get(m.covariance, slot))
     mine, ends = get(m.segments_world.endpoints, slot), get(m.segments_world.endpoints, like)
-    line, line_like = jax.vmap(polar_through)(mine), jax.vmap(jax.vmap(polar_through))(ends)
-    n = normal(line_like)
-    off = lambda x: jnp.abs(x[:, 0] * n[..., 0] + x[:, 1] * n[..., 1] - line_like.rho)
-    turn = (wrap if rules.directed else wrap_axial)(line.theta - line_like.theta)
+    # by unit vectors: angles of all pairs would take most of the time
+    d, d_like = _unit(mine), _unit(ends)
+    cos = d[:, 0] * d_like[..., 0] + d[:, 1] * d_like[..., 1]
+    off = lambda x: jnp.abs(
+        (x[:, 1] - ends[..., 0, 1]) * d_like[..., 0] - (x[:, 0] - ends[..., 0, 0]) * d_like[..., 1]
+    )
     updates, updates_like = get(m.updates, slot), get(m.updates, like)
     double = (
         (jnp.maximum(off(mine[:, 0]), off(mine[:, 1])) < rules.merge_distance)
-        & (jnp.abs(turn) < rules.merge_angle)
+        & ((cos if rules.directed else jnp.abs(cos)) > jnp.cos(rules.merge_angle))
         & (-overlap(mine, ends) < rules.join_gap)
         & (raised(like) == raised(slot))
         & ((updates_like > updates) | ((updates_like == updates) & (like < slot)))  # older
         & get(m.valid, like)
         & get(m.valid, slot)
     )
-    into = jnp.where(double, like, K).min(axis=0)  # the first of them
-    dying = jnp.zeros(K, bool).at[slot].max(into < K, mode="drop")
-    into = jnp.where(get(dying, into), K, into)
 
-    old = get(m.segments_world.endpoints, into)
-    joined = _spanned(jax.vmap(polar_through)(old), old, mine, _together(into, K))
-    segments = Segments(
-        m.segments_world.endpoints.at[into].set(joined, mode="drop"),
-        m.valid.at[jnp.where(into < K, slot, K)].set(False, mode="drop"),
-    )
+    def joined():
+        into = jnp.where(double, like, K).min(axis=0)  # the first of them
+        dying = jnp.zeros(K, bool).at[slot].max(into < K, mode="drop")
+        into = jnp.where(get(dying, into), K, into)
+        old = get(m.segments_world.endpoints, into)
+        whole = _spanned(jax.vmap(polar_through)(old), old, mine, _together(into, K))
+        return Segments(
+            m.segments_world.endpoints.at[into].set(whole, mode="drop"),
+            m.valid.at[jnp.where(into < K, slot, K)].set(False, mode="drop"),
+        )
+
+    segments = jax.lax.cond(in_any_run(double.any()), joined, lambda: m.segments_world)
     return eqx.tree_at(lambda m: m.segments_world, m, segments)
+
+
+def _unit(endpoints):
+    d = endpoints[..., 1, :] - endpoints[..., 0, :]
+    return safe_divide(d, safe_norm(d)[..., None])
 
 
 def _forget(rules, m):
