@@ -56,6 +56,39 @@ def mahalanobis(
     return _quadratic(_symmetric(precision), difference[..., 0], difference[..., 1])
 
 
+class Pairs(eqx.Module):
+    """Each sighting with each of its candidates, as far as no pose is needed to compare them.
+
+    Numbers of what is padding are zero. Worked out once, whatever is compared with it.
+    """
+
+    valid: Bool[Array, "M"]  # sightings
+    there: Bool[Array, "M C"]
+    difference: tuple[Float[Array, "M C"], ...]  # of `_differences`
+    precision: tuple[Float[Array, "M C"], ...]  # W by its elements, tilt apart
+    precision_tilt: tuple[Float[Array, "M C"], ...]
+    tilt: Float[Array, "M 2 2"]  # J = d(rho, theta) / d(pitch, roll)
+    normal_equations: Float[Array, "M C 11"]  # Jᵀ W J, and Jᵀ W d as a function of the pose
+
+
+def pair(sightings: Sightings, candidates: Candidates) -> Pairs:
+    """Sightings and their candidates, made ready for `compare`."""
+    there = sightings.valid[:, None] & candidates.valid
+    difference, loose, W = jax.tree.map(
+        lambda a: jnp.where(there, a, 0),
+        (_differences(sightings, candidates), _symmetric(candidates.precision_tilt),
+         _symmetric(candidates.precision)),
+    )  # fmt: skip
+    J = jnp.where(sightings.valid[:, None, None], sightings.tilt, 0)
+    by_tilt = [(J[:, 0, k, None], J[:, 1, k, None]) for k in range(2)]  # pitch, roll
+    JW = [(W[0] * rho + W[1] * theta, W[1] * rho + W[2] * theta) for rho, theta in by_tilt]
+    A = [JW[i][0] * by_tilt[j][0] + JW[i][1] * by_tilt[j][1] for i, j in ((0, 0), (0, 1), (1, 1))]
+    d_rho, d_theta, by_x, by_y = difference
+    b = [[r * d_rho + t * d_theta, r * by_x, r * by_y, t] for r, t in JW]
+    sums = jnp.stack([*A, *b[0], *b[1]], axis=-1)
+    return Pairs(sightings.valid, there, difference, W, loose, J, sums)
+
+
 class Comparison(eqx.Module):
     """Poses against the map; particles are the last axis, over which the loops run."""
 
@@ -66,11 +99,7 @@ class Comparison(eqx.Module):
 
 
 def compare(
-    sensor: SensorModel,
-    sightings: Sightings,
-    candidates: Candidates,
-    T_predicted_foot: SE2,
-    used: Bool[Array, "M *#poses"],
+    sensor: SensorModel, pairs: Pairs, T_predicted_foot: SE2, used: Bool[Array, "M *#poses"]
 ) -> Comparison:
     """log L = -1/2 sum_m min(min_k e[m,k], e_max) of one pose or of many.
 
@@ -90,16 +119,9 @@ def compare(
     - `used`: which sightings may match, of each particle's own SoF extraction. The others cost
       e_max too: a pose must not win by taking nothing for floor.
     """
-    poses, C = T_predicted_foot.yaw.shape, candidates.kappa.shape[1]
+    poses, C = T_predicted_foot.yaw.shape, pairs.there.shape[1]
     x, y, yaw = T_predicted_foot.xy[..., 0], T_predicted_foot.xy[..., 1], T_predicted_foot.yaw
     of_poses = lambda a: a.reshape(*a.shape, *[1] * len(poses))
-    there = sightings.valid[:, None] & candidates.valid
-    difference, loose, W = jax.tree.map(
-        lambda a: jnp.where(there, a, 0),
-        (_differences(sightings, candidates), _symmetric(candidates.precision_tilt),
-         _symmetric(candidates.precision)),
-    )  # fmt: skip
-    d_rho, d_theta, by_x, by_y = difference
 
     def error(W, of, difference, rho=0.0, theta=0.0):
         d_rho, d_theta, by_x, by_y = map(of, difference)
@@ -114,8 +136,8 @@ def compare(
         key = sortable(error(loose, of_poses, difference), c, width)
         return jnp.where(of_poses(there) & (key < best), key, best), None
 
-    none = jnp.full((len(there), *poses), sortable(jnp.asarray(sensor.e_max), C, width))
-    each = jax.tree.map(lambda a: a.T, (there, loose, difference))
+    none = jnp.full((len(used), *poses), sortable(jnp.asarray(sensor.e_max), C, width))
+    each = jax.tree.map(lambda a: a.T, (pairs.there, pairs.precision_tilt, pairs.difference))
     choice = jax.lax.scan(nearer, none, (jnp.arange(C), *each))[0] & (width - 1)
     choice = jnp.where(used, choice, C).astype(int)
 
@@ -125,24 +147,27 @@ def compare(
             value = jnp.where(choice == c, of_poses(a[:, c]), value)
         return value
 
-    J = jnp.where(sightings.valid[:, None, None], sightings.tilt, 0)
-    by_tilt = [(J[:, 0, k, None], J[:, 1, k, None]) for k in range(2)]  # pitch, roll
-    JW = [(W[0] * rho + W[1] * theta, W[1] * rho + W[2] * theta) for rho, theta in by_tilt]
-    A = [JW[i][0] * by_tilt[j][0] + JW[i][1] * by_tilt[j][1] for i, j in ((0, 0), (0, 1), (1, 1))]
-    b = [[r * d_rho + t * d_theta, r * by_x, r * by_y, t] for r, t in JW]
     chosen = choice[:, None] == of_poses(jnp.arange(C))
     sums = jnp.einsum(
-        "smc,mc...->s...", jnp.stack([*A, *b[0], *b[1]]), chosen.astype(float),
+        "mcs,mc...->s...", pairs.normal_equations, chosen.astype(float),
         precision=jax.lax.Precision.HIGHEST,
     )  # fmt: skip
     gradient = [s[0] + s[1] * x + s[2] * y + s[3] * yaw for s in (sums[3:7], sums[7:])]
     tilt, _, prior = _solve_tilt(sensor, sums[:3], gradient)
 
+    J = pairs.tilt
     rho, theta = (of_poses(J[:, i, 0]) * tilt[0] + of_poses(J[:, i, 1]) * tilt[1] for i in range(2))
-    tight = jnp.minimum(error(W, of_choice, difference, rho, theta), sensor.e_max)
-    tight = jnp.where(choice < C, tight, sensor.e_max)
-    total = jnp.sum(jnp.where(of_poses(sightings.valid), tight, 0), axis=0)
+    tight = error(pairs.precision, of_choice, pairs.difference, rho, theta)
+    tight = jnp.where(choice < C, jnp.minimum(tight, sensor.e_max), sensor.e_max)
+    total = jnp.sum(jnp.where(of_poses(pairs.valid), tight, 0), axis=0)
     return Comparison(-0.5 * (total + prior), jnp.where(choice < C, choice, 0), tight, tilt)
+
+
+def nothing_seen(sensor: SensorModel, pairs: Pairs) -> Comparison:
+    """What `compare` says of any one pose where no sighting is valid."""
+    M = pairs.valid.shape[0]
+    unlike = jnp.full(M, jnp.asarray(sensor.e_max, float))
+    return Comparison(jnp.zeros(()), jnp.zeros(M, int), unlike, jnp.zeros(2))
 
 
 def sortable(

@@ -9,7 +9,14 @@ from sofjax.association import Association, gate_probability
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-from sofjax.likelihood import adapt_noise, compare, log_density, pixels_and_weight
+from sofjax.likelihood import (
+    adapt_noise,
+    compare,
+    log_density,
+    nothing_seen,
+    pair,
+    pixels_and_weight,
+)
 from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, sample_slip
 from sofjax.observation import Observation
 from sofjax.padding import half_if_enough, in_any_run
@@ -189,20 +196,25 @@ def step(
     near, hidden = nearby(rules, state.segment_map, T_world_foot, reach)
     lines = state.segment_map.take(near)
     candidates, at, nearest = propose(rules, sensor, lines, sightings, T_world_foot)
+    pairs = pair(sightings, candidates)
     feet = T_world_foot.inverse() @ (T_world_robot @ mount.T_robot_foot)
     counted = lambda T: sof(T).is_floor if config.filter.gate_each else sightings.valid
-    seen_from = lambda T: compare(
-        sensor, sightings, candidates, T_world_foot.between(T @ mount.T_robot_foot), counted(T)
-    )
+
+    def seen_from(T):  # a `cond`, as XLA would otherwise work it out anew for whoever asks
+        of_one = lambda: compare(
+            sensor, pairs, T_world_foot.between(T @ mount.T_robot_foot), counted(T)
+        )
+        nothing = lambda: nothing_seen(sensor, pairs)
+        return jax.lax.cond(in_any_run(sightings.valid.any()), of_one, nothing)
+
     if config.filter.soft:
         unused = observation.segments_image.valid & ~sightings.valid
         many = in_view(rules, camera, mount, lines, predicted).sum(), unused.sum()
         of_soft = lambda T, use: _log_density(config, camera, sightings, candidates, T, use, *many)
         log_likelihood = jax.vmap(of_soft)(feet, used)
     else:
-        of_hard = lambda rows: compare(sensor, *rows[:2], feet, rows[2]).log_likelihood
-        rows = sightings, candidates, used.T
-        log_likelihood = weight * half_if_enough(of_hard, rows, sightings.valid)
+        of_hard = lambda rows: compare(sensor, rows[0], feet, rows[1]).log_likelihood
+        log_likelihood = weight * half_if_enough(of_hard, (pairs, used.T), sightings.valid)
     log_weight = moved.log_weight + log_likelihood
     log_evidence = jax.nn.logsumexp(log_weight)
     weighted = Particles(T_world_robot, bias, log_weight - log_evidence)

@@ -34,7 +34,7 @@ from sofjax.geometry import (
 from sofjax.geometry.lines import line_point_distance, polar_in_frame, polar_through
 from sofjax.geometry.segments import clip
 from sofjax.geometry.two_view import transfer_segment
-from sofjax.likelihood import Candidates, compare
+from sofjax.likelihood import Candidates, compare, pair
 from sofjax.motion import MotionModel, prior_bias, sample_motion, sample_slip
 from sofjax.segment_map import MapRules, appear, believed
 from sofjax.sightings import SensorModel, Sightings, sight
@@ -395,7 +395,7 @@ def likelihood(p, sensor):
         line, jnp.ones((4, 2)) + p[11], W, W, jnp.broadcast_to(valid > 0.5, (4, 2))
     )
     used = jnp.broadcast_to(used > 0.5, 4)
-    found = compare(sensor, sightings, candidates, pose_of(p[:3]), used)
+    found = compare(sensor, pair(sightings, candidates), pose_of(p[:3]), used)
     return found.log_likelihood, found.tilt
 
 
@@ -447,7 +447,7 @@ def test_gradients_with_some_segments_masked_are_those_of_the_others():
     @jit_quickly
     @jax.grad
     def gradient(p, sightings, lines, used):
-        return compare(sensor, sightings, lines, pose_of(p), used).log_likelihood
+        return compare(sensor, pair(sightings, lines), pose_of(p), used).log_likelihood
 
     mask = jnp.isin(jnp.arange(4), keep)
     fewer = jax.tree.map(lambda a: a[keep], (found, lines))
@@ -478,7 +478,7 @@ def test_padding_of_any_finite_precision_does_not_spread():
     )
 
     def f(p):
-        found_here = compare(SensorModel(), found, lines, pose_of(p), jnp.ones(2, bool))
+        found_here = compare(SensorModel(), pair(found, lines), pose_of(p), jnp.ones(2, bool))
         return found_here.log_likelihood, found_here.tilt
 
     assert_finite(f, [0.1, 0.2, 0.1])

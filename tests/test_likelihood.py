@@ -1,5 +1,7 @@
 """One pose against the map; III.A."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,12 +9,23 @@ import reference
 from conftest import jit_quickly
 
 from sofjax.geometry import SE2, PolarLine
-from sofjax.likelihood import Candidates, adapt_noise, compare, mahalanobis, pixels_and_weight
+from sofjax.likelihood import (
+    Candidates,
+    adapt_noise,
+    compare,
+    mahalanobis,
+    nothing_seen,
+    pair,
+    pixels_and_weight,
+)
 from sofjax.sightings import SensorModel, Sightings
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-compare_pose = jit_quickly(compare)
+
+@jit_quickly
+def compare_pose(sensor, sightings, candidates, T_predicted_foot, used):
+    return compare(sensor, pair(sightings, candidates), T_predicted_foot, used)
 
 
 def pose(x, y, yaw):
@@ -172,6 +185,16 @@ def test_what_is_not_valid_counts_nothing_and_what_may_not_match_costs_the_most(
     assert unused.log_likelihood == pytest.approx(expected - 2 * 9.0 / 2)
     nothing = compare_pose(STIFF, sightings, candidates, SE2.identity(), jnp.zeros(6, bool))
     assert nothing.log_likelihood == pytest.approx(-6 * 9.0 / 2)
+
+
+def test_where_nothing_lies_on_the_floor_the_answer_is_known_without_comparing(rng):
+    sightings, candidates = as_arrays(*random_problem(rng))
+    sightings = eqx.tree_at(lambda s: s.valid, sightings, jnp.zeros(6, bool))
+    found = compare_pose(STIFF, sightings, candidates, pose(0.1, 0.2, 0.3), jnp.zeros(6, bool))
+    known = nothing_seen(STIFF, pair(sightings, candidates))
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
 
 
 def test_the_choice_is_the_candidate_that_costs_least(rng):
