@@ -156,6 +156,7 @@ def sample_slip(
     along, turn = model.slip_distance * along, model.slip_turn * turn
     each = SE2.exp(jnp.stack([along, jnp.zeros(trying), turn], axis=-1))
     each = jnp.where(possible, jnp.concatenate([each.xy, each.yaw[:, None]], axis=1), 0)
+    # put in their places, as XLA would work each out anew for all of its twenty
     slip = jnp.zeros((count, 3)).at[tries].set(each, mode="drop")
     probability = jnp.where(possible, probability, 1 / ONE_IN)
     log_weight = jnp.full(count, jnp.log1p(-probability) - jnp.log1p(-1 / ONE_IN))

@@ -118,5 +118,5 @@ def pose_covariance(particles: Particles) -> Float[Array, "3 3"]:
     """
     mean, T = mean_pose(particles), particles.T_world_robot
     d = jnp.stack([T.xy[:, 0] - mean.xy[0], T.xy[:, 1] - mean.xy[1], T.yaw - mean.yaw])
-    w = jnp.exp(particles.log_weight)
+    w = jnp.exp(particles.log_weight)  # last, as products of thin matrices are slow in batches
     return d[:, None] * d @ w

@@ -26,6 +26,12 @@ class Segments(eqx.Module):
         return safe_norm(self.endpoints[..., 1, :] - self.endpoints[..., 0, :])
 
 
+def unit(endpoints: Float[Array, "*batch 2 2"]) -> Float[Array, "*batch 2"]:
+    """The unit vector from the first end to the second; zero if there is no length."""
+    d = endpoints[..., 1, :] - endpoints[..., 0, :]
+    return safe_divide(d, safe_norm(d)[..., None])
+
+
 def overlap(
     first: Float[Array, "*#batch 2 2"], second: Float[Array, "*#batch 2 2"]
 ) -> Float[Array, "*batch"]:
@@ -34,9 +40,8 @@ def overlap(
     Negative is the gap between them; zero if the second has no length. In numbers and not as
     products of matrices, which would not fuse where batches are broadcast to all pairs.
     """
-    d = second[..., 1, :] - second[..., 0, :]
-    unit = safe_divide(d, safe_norm(d)[..., None])
-    along = lambda x: x[..., 0] * unit[..., 0] + x[..., 1] * unit[..., 1]
+    d = unit(second)
+    along = lambda x: x[..., 0] * d[..., 0] + x[..., 1] * d[..., 1]
     a0, a1, b0, b1 = (along(ends[..., i, :]) for ends in (first, second) for i in (0, 1))
     lesser = lambda a, b: jnp.where(a < b, a, b)  # `minimum` looks for NaN besides, in every pair
     greater = lambda a, b: jnp.where(a < b, b, a)

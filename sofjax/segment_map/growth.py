@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sofjax.geometry.angles import safe_divide, safe_norm, safe_sqrt
+from sofjax.geometry.angles import safe_norm, safe_sqrt
 from sofjax.geometry.lines import (
     PolarLine,
     alignment,
@@ -17,7 +17,7 @@ from sofjax.geometry.lines import (
 )
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
-from sofjax.geometry.segments import Segments, overlap
+from sofjax.geometry.segments import Segments, overlap, unit
 from sofjax.padding import in_any_run
 from sofjax.segment_map.lines import MapRules, SegmentMap, appear, believed, is_raised
 from sofjax.sightings import SensorModel, Sightings
@@ -230,7 +230,7 @@ def _merge(rules, m, slot, like):
     raised = lambda slot: is_raised(rules, get(m.line, slot), get(m.covariance, slot))
     mine, ends = get(m.segments_world.endpoints, slot), get(m.segments_world.endpoints, like)
     # by unit vectors: angles of all pairs would take most of the time
-    d, d_like = _unit(mine), _unit(ends)
+    d, d_like = unit(mine), unit(ends)
     cos = d[:, 0] * d_like[..., 0] + d[:, 1] * d_like[..., 1]
     off = lambda x: jnp.abs(
         (x[:, 1] - ends[..., 0, 1]) * d_like[..., 0] - (x[:, 0] - ends[..., 0, 0]) * d_like[..., 1]
@@ -259,11 +259,6 @@ def _merge(rules, m, slot, like):
 
     segments = jax.lax.cond(in_any_run(double.any()), joined, lambda: m.segments_world)
     return eqx.tree_at(lambda m: m.segments_world, m, segments)
-
-
-def _unit(endpoints):
-    d = endpoints[..., 1, :] - endpoints[..., 0, :]
-    return safe_divide(d, safe_norm(d)[..., None])
 
 
 def _forget(rules, m):
