@@ -1,13 +1,17 @@
 """Motion model: Gaussian about the odometer's reading, whose systematic errors it learns; III.A."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
+from sofjax.observation import Observation
 
 
 class MotionModel(eqx.Module):
@@ -28,6 +32,8 @@ class MotionModel(eqx.Module):
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip
     slip_turn: float = 0.05  # radians
+    unknown_distance: float = 0.3  # metres, standard deviation of a motion that was not read ...
+    unknown_turn: float = 0.3  # ... radians
 
 
 class OdometerBias(eqx.Module):
@@ -67,9 +73,17 @@ def read_twist(odometer: SE2, way: Float[Array, "3"], b: Float[Array, "4"]) -> F
     return jnp.stack([forward * (1 + b[0]), sideways, turn])
 
 
-def odometer_sigma(model: MotionModel, way: Float[Array, "3"], least: float) -> Float[Array, "3"]:
+def odometer_sigma(
+    model: MotionModel,
+    way: Float[Array, "3"],
+    least: float,
+    unknown: Float[Array, "3"] | None = None,
+) -> Float[Array, "3"]:
     """Standard deviations of a reading's noise (v_x, v_y, omega) after a way of `way_of`, metres
     and radians; `least` of them is left where nothing was driven.
+
+    **Arguments:**
+    - `unknown`: variance of what was not read at all, if there is such.
     """
     distance, left, right = way
     variance = jnp.stack([
@@ -77,6 +91,8 @@ def odometer_sigma(model: MotionModel, way: Float[Array, "3"], least: float) -> 
         model.lateral_noise**2 * distance,
         model.heading_noise**2 * distance + model.turn_noise**2 * (left - right),
     ])  # fmt: skip
+    if unknown is not None:
+        variance = variance + unknown
     return jnp.sqrt(least**2 + variance)
 
 
@@ -121,6 +137,47 @@ def sample_motion(
     gain = covariance @ A.T / jnp.where(sigma > 0, sigma, 1) ** 2
     learned = OdometerBias(bias.mean + innovation @ gain.T, covariance - gain @ A @ covariance)
     return SE2.exp(jnp.stack([moved[..., 0], across, moved[..., 1]], axis=-1)), learned
+
+
+def read_or_unknown(
+    model: MotionModel, odometer: SE2, sigma: Float[Array, "*batch 3"] | None
+) -> tuple[SE2, Float[Array, "*batch 3"]]:
+    """The reading, and what is not known of it; a reading that is not finite says nothing.
+
+    **Arguments:**
+    - `sigma`: what was not known before, as `Observation.motion_sigma`.
+
+    **Returns:** the identity in the place of what is not finite, and standard deviations
+    (forward, sideways, turn): metres and radians.
+    """
+    reading = jnp.concatenate([odometer.xy, odometer.yaw[..., None]], axis=-1)
+    finite = jnp.isfinite(reading).all(-1, keepdims=True)
+    reading = jnp.where(finite, reading, 0)
+    nothing = jnp.stack([model.unknown_distance, model.unknown_distance, model.unknown_turn])
+    sigma = jnp.where(finite, 0.0 if sigma is None else sigma, nothing)
+    return SE2(reading[..., :2], reading[..., 2]), sigma
+
+
+def without_unread_motions(model: MotionModel, log: Observation) -> Observation:
+    """A log whose motions that are not finite are unknown ones; the log itself if there is none.
+
+    On the host, for what sums motions up; `slam.step` asks `read_or_unknown` of each.
+    """
+    if np.isfinite(log.motion.xy).all() and np.isfinite(log.motion.yaw).all():
+        return log
+    motion, sigma = read_or_unknown(model, log.motion, log.motion_sigma)
+    return dataclasses.replace(log, motion=motion, motion_sigma=sigma)
+
+
+def sample_unknown(sigma: Float[Array, "3"], key: PRNGKeyArray, count: int) -> SE2:
+    """Draw N motions that an odometer did not tell, to go before those drawn of its reading.
+
+    They are apart from the reading, so that nothing is learned of the odometer's errors from them.
+
+    **Arguments:**
+    - `sigma`: standard deviations (forward, sideways, turn), metres and radians.
+    """
+    return SE2.exp(sigma * jax.random.normal(key, (count, 3)))
 
 
 ONE_IN = 20  # of so many particles one tries a slip

@@ -1,7 +1,7 @@
 """What the robot gives the filter at each image."""
 
 import equinox as eqx
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
@@ -16,3 +16,6 @@ class Observation(eqx.Module):
     segments_image: Segments  # capacity M, pixels of the undistorted image
     motion: SE2  # T_previous_current as the odometer reads it; the identity at the first image
     overflow: Int[Array, "*batch"]  # segments that were detected and did not fit into M
+    # standard deviation of what the odometer does not tell of the motion (forward, sideways, turn),
+    # beyond its noise: metres and radians; None if it tells all of it
+    motion_sigma: Float[Array, "*batch 3"] | None = None

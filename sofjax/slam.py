@@ -17,7 +17,15 @@ from sofjax.likelihood import (
     pair,
     pixels_and_weight,
 )
-from sofjax.motion import MotionModel, OdometerBias, prior_bias, sample_motion, sample_slip
+from sofjax.motion import (
+    MotionModel,
+    OdometerBias,
+    prior_bias,
+    read_or_unknown,
+    sample_motion,
+    sample_slip,
+    sample_unknown,
+)
 from sofjax.observation import Observation
 from sofjax.padding import half_if_enough, in_any_run
 from sofjax.particles import (
@@ -98,8 +106,9 @@ class StepInfo(eqx.Module):
     misfit: Float[Array, "*batch"]  # mean error e of the matched segments; 2 if sigmas are true
     detected: Int[Array, "*batch"]
     below_horizon: Int[Array, "*batch"]  # on the floor's side of the horizon and within range
-    associated: Int[Array, "*batch"]  # by eq. (9)
-    matched: Int[Array, "*batch"]  # to the map
+    associated: Int[Array, "*batch"]  # of them, by eq. (9)
+    reobserved: Int[Array, "*batch"]  # of those, segments of lines that the map knows
+    matched: Int[Array, "*batch"]  # to the map, by eq. (9) or not
     across: Int[Array, "*batch"]  # of them, those that run across the heading and hold the distance
     born: Int[Array, "*batch"]  # new in the map
     map_overflow: Int[Array, "*batch"]  # found no free slot
@@ -162,13 +171,18 @@ def step(
     key, key_motion, key_slip, key_choice = jax.random.split(state.key, 4)
 
     # 1-3) move, and sample N particles by the motion model
-    motion, bias = sample_motion(
-        config.motion, state.particles.bias, observation.motion, key_motion
+    odometer, unknown = read_or_unknown(
+        config.motion, observation.motion, observation.motion_sigma
     )
-    slip, log_ratio = sample_slip(
-        config.motion, observation.motion, state.noise < SURE, key_slip, N
+    motion, bias = sample_motion(config.motion, state.particles.bias, odometer, key_motion)
+    slip, log_ratio = sample_slip(config.motion, odometer, state.noise < SURE, key_slip, N)
+    start = state.particles.T_world_robot
+    start = jax.lax.cond(
+        in_any_run((unknown > 0).any()),
+        lambda: start @ sample_unknown(unknown, jax.random.fold_in(key_motion, 1), N),
+        lambda: start,
     )
-    unslipped = Particles(state.particles.T_world_robot @ motion, bias, state.particles.log_weight)
+    unslipped = Particles(start @ motion, bias, state.particles.log_weight)
     T_world_robot = unslipped.T_world_robot @ slip
     prior = state.particles.log_weight + log_ratio
     moved = Particles(T_world_robot, bias, prior - jax.nn.logsumexp(prior))
@@ -263,7 +277,7 @@ def step(
         believed = OdometerBias(mean_bias, bias.covariance)
         window, segment_map, T_new_old = slide(
             config.window, rules, sensor, config.motion, window, segment_map,
-            mount.T_robot_foot, observation.motion, chosen, best.tilt, believed, sightings,
+            mount.T_robot_foot, odometer, unknown, chosen, best.tilt, believed, sightings,
             new_at, config.filter.max_depth,
         )  # fmt: skip
         chosen = T_new_old @ chosen
@@ -290,6 +304,7 @@ def step(
         detected=detected.sum(),
         below_horizon=sightings.valid.sum(),
         associated=is_sof.sum(),
+        reobserved=(is_sof & known).sum(),
         matched=known.sum(),
         across=(known & (jnp.abs(jnp.sin(sightings.line.theta)) > ACROSS)).sum(),
         born=new.sum() - overflow,

@@ -11,6 +11,7 @@ from sofjax.geometry.floor import floor_homography, horizon, segment_to_floor
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 from sofjax.geometry.two_view import two_view_homography
+from sofjax.observation import Observation
 
 
 class View(eqx.Module):
@@ -94,3 +95,36 @@ def _far_enough(config: Association, view: View, T_world_robot: SE2) -> Bool[Arr
     motion = view.T_world_robot.between(T_world_robot)
     far = jnp.sum(motion.xy**2) >= config.baseline_distance**2
     return far | (jnp.abs(motion.yaw) >= config.baseline_angle)
+
+
+@jax.jit
+def extract_along(
+    config: Association,
+    camera: Camera,
+    mount: Mount,
+    log: Observation,
+    max_depth: Float[Array, ""] | float = 20.0,
+) -> SofExtraction:
+    """SoF of a whole log by the odometer's motion alone, each image against one a baseline before.
+
+    **Arguments:**
+    - `log`: observations with a leading axis T.
+
+    **Returns:** the extractions with a leading axis T.
+    """
+
+    def next_image(carry, observation):
+        T_world_robot, recent, reference = carry
+        T_world_robot = T_world_robot @ observation.motion
+        view = view_a_baseline_away(config, recent, reference, T_world_robot)
+        second = observation.segments_image
+        found = extract(
+            config, camera, mount, view.segments_image, second,
+            view.T_world_robot.between(T_world_robot), max_depth,
+        )  # fmt: skip
+        kept = keep_views(config, recent, reference, View(second, T_world_robot))
+        return (T_world_robot, *kept), found
+
+    start = jax.tree.map(lambda a: jnp.zeros_like(a[0]), (log.motion, log.segments_image))
+    none = View(start[1], start[0])
+    return jax.lax.scan(next_image, (start[0], none, none), log)[1]

@@ -55,7 +55,8 @@ class Keyframe(eqx.Module):
     tilt: Float[Array, "*batch 2"]  # wobble (pitch, roll), radians
     sightings: Sightings  # [*batch, M]
     motion: SE2  # since the keyframe before, as read ...
-    way: Float[Array, "*batch 3"]  # ... and how far that was, of `way_of`
+    way: Float[Array, "*batch 3"]  # ... how far that was, of `way_of`, ...
+    unknown: Float[Array, "*batch 3"]  # ... and the variance of what was not read of it
     trust: Float[Array, "*batch"]  # in that reading: less than 1 where the wheels may have slipped
     bias: OdometerBias  # what was believed of its errors
 
@@ -75,28 +76,31 @@ class Window(eqx.Module):
     known: Known  # of all lines of the map
     motion: SE2  # since the latest keyframe, as read
     way: Float[Array, "3"]
+    unknown: Float[Array, "3"]  # variance of what was not read of it
 
 
 def empty_window(rules: WindowRules, capacity: int, sightings: Sightings) -> Window:
     """**Arguments:** `capacity`: K of the map. `sightings`: any, for their number M."""
     zero = SE2.identity()
     bias = OdometerBias(jnp.zeros(BIAS), jnp.eye(BIAS))
-    one = Keyframe(zero, jnp.zeros(2), sightings, zero, jnp.zeros(3), jnp.zeros(()), bias)
+    none = jnp.zeros(3)
+    one = Keyframe(zero, jnp.zeros(2), sightings, zero, none, none, jnp.zeros(()), bias)
     frames = jax.tree.map(lambda a: jnp.zeros((rules.keyframes, *a.shape), a.dtype), one)
     known = Known(jnp.zeros((capacity, 3)), jnp.zeros((capacity, 3, 3)))
-    return Window(frames, jnp.zeros((), int), known, zero, jnp.zeros(3))
+    return Window(frames, jnp.zeros((), int), known, zero, none, none)
 
 
 def slide(
     rules: WindowRules, map_rules: MapRules, sensor: SensorModel, model: MotionModel,
     window: Window, segment_map: SegmentMap, T_robot_foot: SE2, odometer: SE2,
-    T_world_robot: SE2, tilt: Float[Array, "2"], bias: OdometerBias, sightings: Sightings,
+    unknown: Float[Array, "3"], T_world_robot: SE2, tilt: Float[Array, "2"], bias: OdometerBias, sightings: Sightings,
     new: Int[Array, "M"], reach: Float[Array, ""] | float,
 ) -> tuple[Window, SegmentMap, SE2]:  # fmt: skip
     """Take an image into account; if it is a keyframe, solve for the window that it ends.
 
     **Arguments:**
     - `odometer`: the motion since the last image, as read.
+    - `unknown`: standard deviation of what was not read of it.
     - `T_world_robot`, `tilt`, `bias`: what the filter makes of the image.
     - `new`: slots of the lines that began with the sightings, K for none.
     - `reach`: metres to the farthest line that may be seen.
@@ -109,7 +113,8 @@ def slide(
     begun = segment_map.line.at[new].get(mode="clip")
     known = Known(put(window.known.line, begun), put(window.known.information, loosely))
     motion, way = window.motion @ odometer, window.way + way_of(odometer)
-    window = Window(window.keyframes, window.count, known, motion, way)
+    variance = window.unknown + unknown**2
+    window = Window(window.keyframes, window.count, known, motion, way, variance)
 
     usable = sightings.valid & ~sightings.upright
     far = (way[0] >= rules.step) | (way[1] - way[2] >= rules.turn)
@@ -117,11 +122,11 @@ def slide(
 
     last = jax.tree.map(lambda a: a[-1], window.keyframes.T_world_robot)
     off = last.between(T_world_robot).log() - read_twist(motion, way, bias.mean)
-    error = jnp.sum((off / odometer_sigma(model, way, LEAST)) ** 2)
+    error = jnp.sum((off / odometer_sigma(model, way, LEAST, variance)) ** 2)
     trust = jnp.minimum(1, jnp.sqrt(SLIPPED / jnp.maximum(error, 1e-6)))
     trust = jnp.where(window.count == 0, 0, trust)
     sightings = eqx.tree_at(lambda s: s.valid, sightings, usable)
-    frame = Keyframe(T_world_robot, tilt, sightings, motion, way, trust, bias)
+    frame = Keyframe(T_world_robot, tilt, sightings, motion, way, variance, trust, bias)
     solve = lambda: _solve(
         rules, map_rules, sensor, model, window, segment_map, T_robot_foot, frame, reach
     )
@@ -172,7 +177,7 @@ def _solve(rules, map_rules, sensor, model, window, segment_map, T_robot_foot, f
     put = lambda a, b: jnp.where(fine, a.at[slots].set(b, mode="drop"), a)
     of_all = jax.tree.map(put, window.known, known)
     latest = jax.tree.map(lambda a: a[-1], frames.T_world_robot)
-    window = Window(frames, count, of_all, SE2.identity(), jnp.zeros(3))
+    window = Window(frames, count, of_all, SE2.identity(), jnp.zeros(3), jnp.zeros(3))
     return window, segment_map, latest @ frame.T_world_robot.inverse()
 
 
@@ -270,7 +275,9 @@ def _odometry(model, sensor, frames: Keyframe, bias, believed: OdometerBias, x) 
         for t, s in ((T, slice(-1)), (T, slice(1, None)), (frames, slice(1, None)))
     )
     twist = jax.vmap(read_twist, in_axes=(0, 0, None))(read.motion, read.way, b)
-    sigma = jax.vmap(odometer_sigma, in_axes=(None, 0, None))(model, read.way, LEAST)
+    sigma = jax.vmap(odometer_sigma, in_axes=(None, 0, None, 0))(
+        model, read.way, LEAST, read.unknown
+    )
     off = (before.between(after).log() - twist) / sigma * read.trust[:, None]
     wobble = (frames.tilt + pose[:, 3:]) / jnp.maximum(sensor.tilt_sigma, 1e-7)
     root = jnp.linalg.cholesky(believed.covariance + 1e-10 * jnp.eye(BIAS))

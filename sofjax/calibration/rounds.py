@@ -12,7 +12,7 @@ from sofjax.calibration.heights import FloorRules, on_floor
 from sofjax.calibration.pairs import TURNS, Estimate, PairNoise, Pairs, U, expected, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
 from sofjax.geometry.camera import Camera, Mount
-from sofjax.motion import MotionModel
+from sofjax.motion import MotionModel, without_unread_motions
 from sofjax.observation import Observation
 
 # where to begin: at the mount given, and far from it
@@ -94,6 +94,7 @@ def fit_drive(
     - `mount`: roughly.
     """
     rules = rules or DriveRules()
+    log = without_unread_motions(rules.noise.odometer, log)
     searched = [_search(camera, start, log, rules) for start in starts(mount, rules)]
     ends = np.array([_place(found.fit.mount) for found in searched])
     agreeing = (_apart(ends[:, None], ends, rules) < 1).all(-1).sum(1)

@@ -36,15 +36,20 @@ def follow(
     """A number for every segment, the same for those that follow one another; -1 for none.
 
     Images that follow one another are so near that a mount wrong by a third still tells where a
-    segment went; who is nearest to whom must be mutual.
+    segment went; who is nearest to whom must be mutual. Nothing is followed over a motion that
+    the odometer does not tell.
     """
     partners = np.stack([np.asarray(p) for p in _partners(rules, camera, estimate, log)])
     valid = np.asarray(log.segments_image.valid)
     T, M = valid.shape
     track = np.full((T, M), -1)
+    sigma = log.motion_sigma
+    untold = np.cumsum(np.zeros(T) if sigma is None else np.asarray(sigma > 0).any(-1))
     count = 0
     for t in range(T):
         for lag in range(1, min(rules.back, t) + 1):
+            if untold[t] > untold[t - lag]:
+                continue
             partner = partners[lag - 1, t]
             take = (track[t] < 0) & (partner >= 0)
             before = np.where(take, track[t - lag][partner], -1)

@@ -1,15 +1,26 @@
 """A drive: a folder in the manner of the TUM data sets, with images, odometry and a camera."""
 
+import os
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
 from sofjax.io.camera_file import CameraFile, read_camera
 from sofjax.io.errors import InputError
+from sofjax.io.odometry import Outage, contradictions, mend, unknown_motion, usual_speeds
 from sofjax.io.text import rows
-from sofjax.io.trajectory import Trajectory, check_increasing, finite, read_trajectory
+from sofjax.io.trajectory import (
+    Trajectory,
+    TrajectoryFile,
+    finite,
+    in_nanoseconds,
+    in_order,
+    read_trajectory_file,
+)
 
+MANY = 8  # warnings of one kind
+MAX_NAME = 1000  # characters of an image's path
 CLOSE = 0.2  # seconds that the odometry may start late or end early without a word
 
 
@@ -22,7 +33,10 @@ class Drive:
     camera_file: CameraFile
     image_stamps: np.ndarray  # [T] float64, seconds, strictly increasing
     image_files: list[Path]  # [T], all inside the folder; a few may be missing
-    odometry: Trajectory
+    odometry: Trajectory  # mended: without what is no motion
+    outages: list[Outage]  # times over which the odometry does not tell the motion
+    contradictions: list[str]  # sentences: why the odometry cannot be what it is taken for
+    remarks: list[str]  # sentences on what was read otherwise than it stands there
     groundtruth: Trajectory | None
     floor_segments: np.ndarray | None  # [S, 2, 2] float64, the true segments, world frame, metres
 
@@ -34,14 +48,22 @@ def read_drive(path: Path) -> Drive:
     """
     path = check_folder(path)
     camera_file = read_camera(path / "camera.yaml")
-    stamps, files = _read_images(path)
-    odometry = _read_odometry(path / "odometry.txt")
-    if outside(odometry, stamps).all():
+    stamps, files, nanoseconds, remarks = _read_images(path)
+    read = _read_odometry(path / "odometry.txt")
+    truth = _read_true_path(path)
+    counted = {"rgb.txt": nanoseconds, "odometry.txt": read.nanoseconds}
+    remarks += read.remarks
+    if truth:
+        counted["groundtruth.txt"] = truth.nanoseconds
+        remarks += truth.remarks
+    _check_units(path, counted)
+    span = read.trajectory.span()
+    if outside(read.trajectory, stamps).all():
         raise InputError(
             f"{path}: the images ({stamps[0]:.3f} to {stamps[-1]:.3f} s) and the odometry "
-            f"({odometry.span()}) never meet; both need the timestamps of one clock, in seconds"
+            f"({span}) never meet; both need the timestamps of one clock, in seconds"
         )
-    groundtruth, floor_segments = read_truth(path)
+    odometry, outages = mend("odometry.txt", read.lines, read.trajectory)
     return Drive(
         path=path,
         name=path.resolve().name,
@@ -49,9 +71,24 @@ def read_drive(path: Path) -> Drive:
         image_stamps=stamps,
         image_files=files,
         odometry=odometry,
-        groundtruth=groundtruth,
-        floor_segments=floor_segments,
+        outages=outages + _without_odometry(odometry, stamps),
+        contradictions=contradictions("odometry.txt", read.lines, read.trajectory, odometry),
+        remarks=remarks,
+        groundtruth=truth and truth.trajectory,
+        floor_segments=_read_true_segments(path),
     )
+
+
+def _check_units(path: Path, nanoseconds: dict[str, bool]) -> None:
+    """Refuse stamps that are nanoseconds in some files and seconds in others."""
+    if any(nanoseconds.values()) and not all(nanoseconds.values()):
+        counted = [name for name, is_so in nanoseconds.items() if is_so]
+        others = [name for name, is_so in nanoseconds.items() if not is_so]
+        raise InputError(
+            f"{path / counted[0]}: its timestamps are nanoseconds and those of "
+            f"{' and '.join(others)} are not; all files of a drive must be in seconds, or all in "
+            "nanoseconds"
+        )
 
 
 def check_folder(path: Path) -> Path:
@@ -65,11 +102,18 @@ def check_folder(path: Path) -> Path:
 
 def read_truth(path: Path) -> tuple[Trajectory | None, np.ndarray | None]:
     """The true path and the true segments [S, 2, 2] of a drive's folder, where they are known."""
-    poses, segments = path / "groundtruth.txt", path / "floor_segments.csv"
-    return (
-        read_trajectory(poses, "the true path") if poses.exists() else None,
-        read_floor_segments(segments) if segments.exists() else None,
-    )
+    poses = _read_true_path(path)
+    return poses and poses.trajectory, _read_true_segments(path)
+
+
+def _read_true_path(path: Path) -> TrajectoryFile | None:
+    file = path / "groundtruth.txt"
+    return read_trajectory_file(file, "the true path") if file.exists() else None
+
+
+def _read_true_segments(path: Path) -> np.ndarray | None:
+    file = path / "floor_segments.csv"
+    return read_floor_segments(file) if file.exists() else None
 
 
 def read_floor_segments(path: Path) -> np.ndarray:
@@ -100,27 +144,65 @@ def motions(drive: Drive) -> np.ndarray:
     return np.concatenate([np.zeros((1, 3)), steps])
 
 
+def motion_sigmas(drive: Drive) -> np.ndarray | None:
+    """What is not known of the motion up to each image, beyond the odometer's noise.
+
+    **Returns:** [T, 3] standard deviations (forward, sideways, turn), metres and radians, zero
+    where the odometry tells the motion; None if it always does.
+    """
+    speeds = usual_speeds(drive.odometry)
+    return unknown_motion(drive.outages, speeds, drive.image_stamps)
+
+
+def odometry_warnings(drive: Drive) -> list[str]:
+    """Sentences on where the odometry does not tell the motion, each with the images in it."""
+    found = []
+    for outage in drive.outages[:MANY]:
+        stamps = drive.image_stamps
+        images = int(((stamps > outage.begin) & (stamps <= outage.end)).sum())
+        between = "the motion in between" if outage.bridged else "the motion there"
+        found.append(
+            f"{outage.sentence}; {between} is taken as unknown ({images} images)"
+        )
+    if len(drive.outages) > MANY:
+        found.append(f"odometry.txt: {len(drive.outages) - MANY} more such places")
+    return found
+
+
 def outside(odometry: Trajectory, stamps: np.ndarray) -> np.ndarray:
     """[T] bool, images over `CLOSE` seconds before the odometry begins or after it ends."""
     return (stamps < odometry.stamps[0] - CLOSE) | (stamps > odometry.stamps[-1] + CLOSE)
 
 
-def _read_odometry(path: Path) -> Trajectory:
+def _without_odometry(odometry: Trajectory, stamps: np.ndarray) -> list[Outage]:
+    """The times before and behind the odometry in which there are images."""
+    begin, end = (float(t) for t in odometry.stamps[[0, -1]])
+    found = []
+    if stamps[0] < begin - CLOSE:
+        told = f"odometry.txt: no row before {begin:.2f} s"
+        found.append(Outage(float(stamps[0]), begin, False, told))
+    if stamps[-1] > end + CLOSE:
+        told = f"odometry.txt: no row after {end:.2f} s"
+        found.append(Outage(end, float(stamps[-1]), False, told))
+    return found
+
+
+def _read_odometry(path: Path) -> TrajectoryFile:
     if not path.exists():
         raise InputError(
             f"{path}: the wheel odometry is missing, and without it neither the motion nor the "
             "scale is known; it must have a row 'timestamp tx ty tz qx qy qz qw' for each pose"
         )
-    odometry = read_trajectory(path, "the odometry")
-    if len(odometry.stamps) < 2:
+    odometry = read_trajectory_file(path, "the odometry")
+    if len(odometry.lines) < 2:
         raise InputError(f"{path}: one pose alone tells no motion; there must be two or more")
     return odometry
 
 
-def _read_images(path: Path) -> tuple[np.ndarray, list[Path]]:
+def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
+    """Stamps in seconds, files, whether the stamps are nanoseconds in the list, and remarks."""
     table = path / "rgb.txt"
-    root = path.resolve()
-    numbers, stamps, files = [], [], []
+    numbers, stamps, names = [], [], []
     for number, line in rows(table, "the list of images"):
         where = f"{table}, line {number}"
         words = line.split(maxsplit=1)
@@ -128,31 +210,61 @@ def _read_images(path: Path) -> tuple[np.ndarray, list[Path]]:
             raise InputError(f"{where}: there must be two columns, 'timestamp file'")
         numbers.append(number)
         stamps.append(finite(where, words[0]))
-        files.append(_inside(where, path, root, words[1]))
-    if not files:
+        names.append(words[1])
+    if not names:
         raise InputError(f"{table}: no image in it; there must be a row 'timestamp file' for each")
-    check_increasing(table, numbers, np.array(stamps))
-    missing = [file for file in files if not file.is_file()]
-    if 2 * len(missing) > len(files):
+    kept, remarks = in_order(table, numbers, stamps, names)
+    folder = _Folder(path)
+    there = [folder.has(f"{table}, line {numbers[i]}", names[i]) for i in kept]
+    if 2 * sum(there) < len(there):
         raise InputError(
-            f"{table}: {len(missing)} of its {len(files)} images are missing, {missing[0]} first; "
-            "the files must lie where the list says"
+            f"{table}: {len(there) - sum(there)} of its {len(there)} images are missing, "
+            f"{path / names[kept[there.index(False)]]} first; the files must lie where the list "
+            "says"
         )
-    return np.array(stamps), files
+    at = np.array(stamps)[kept]
+    nanoseconds = in_nanoseconds(at)
+    if nanoseconds:
+        at = 1e-9 * at
+    return at, [path / names[i] for i in kept], nanoseconds, remarks
 
 
-def _inside(where: str, path: Path, root: Path, name: str) -> Path:
-    """The image's path, refused if it leaves the drive's folder in any way."""
-    plain = PurePosixPath(name)
-    odd = "\0" in name or max(map(len, plain.parts)) > 200
-    if odd or plain.is_absolute() or ".." in plain.parts:
-        right = "must be a path inside the drive's folder"
-        raise InputError(f"{where}: the image {name!r:.120} {right}")
-    file = path / plain
-    try:
-        inside = file.resolve().is_relative_to(root)
-    except (OSError, RuntimeError):  # a ring of links
-        inside = False
-    if not inside:
-        raise InputError(f"{where}: {name} is a link that leads out of the drive's folder")
-    return file
+class _Folder:
+    """What lies in a drive's folder, each folder looked at once; links must not lead out of it."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._root = path.resolve()
+        self._inside: dict[str, dict[str, os.DirEntry]] = {}
+
+    def has(self, where: str, name: str) -> bool:
+        """Whether an image is there; refused if its name leaves the drive's folder in any way."""
+        parts = name.split("/") if len(name) <= MAX_NAME else [".."]
+        if "\0" in name or ".." in parts or name.startswith("/"):
+            right = "must be a path inside the drive's folder"
+            raise InputError(f"{where}: the image {name!r:.120} {right}")
+        parent, _, base = name.rpartition("/")
+        if parent not in self._inside:
+            self._check_link(where, parent)
+            self._inside[parent] = self._entries(parent)
+        entry = self._inside[parent].get(base)
+        if entry is not None and entry.is_symlink():
+            self._check_link(where, name)
+        return entry is not None and entry.is_file()
+
+    def _entries(self, parent: str) -> dict[str, os.DirEntry]:
+        try:
+            with os.scandir(self._path / parent) as entries:
+                return {entry.name: entry for entry in entries}
+        except OSError:  # no such folder
+            return {}
+
+    def _check_link(self, where: str, name: str) -> None:
+        try:
+            inside = (self._path / name).resolve().is_relative_to(self._root)
+        except (OSError, RuntimeError):  # a ring of links
+            inside = False
+        if not inside:
+            raise InputError(
+                f"{where}: {name!r:.120} is a link that leads out of the drive's folder"
+            )

@@ -1,5 +1,6 @@
 """Trajectories in the TUM form: one row a pose, `timestamp tx ty tz qx qy qz qw`."""
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from sofjax.io.text import rows, write_atomically
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 HEAD = f"# T_world_robot: {COLUMNS}\n"
+MANY = 12  # lines that a sentence names
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,26 @@ class Trajectory:
         return f"{self.stamps[0]:.3f} to {self.stamps[-1]:.3f} s"
 
 
+@dataclass(frozen=True)
+class TrajectoryFile:
+    """A trajectory, and how it stands in its file."""
+
+    trajectory: Trajectory
+    lines: np.ndarray  # [n] the line of each pose
+    nanoseconds: bool  # what its timestamps are in the file
+    remarks: list[str]  # sentences on what was read otherwise than it stands there
+
+
 def read_trajectory(path: Path, what: str = "a trajectory") -> Trajectory:
+    """The poses of a TUM file, as `read_trajectory_file` reads them."""
+    return read_trajectory_file(path, what).trajectory
+
+
+def read_trajectory_file(path: Path, what: str) -> TrajectoryFile:
     """Read a TUM file of the robot's poses; heights and tilts are left out.
+
+    Rows that stand there twice are dropped, and stamps in nanoseconds become seconds, with a
+    remark each.
 
     **Raises:** `InputError` that names the line for anything but rows of 8 finite numbers with
     increasing stamps, unit quaternions and the z axis up.
@@ -47,20 +67,64 @@ def read_trajectory(path: Path, what: str = "a trajectory") -> Trajectory:
         numbers.append(number)
     if not table:
         raise InputError(f"{path}: no pose in it; {what} has a row '{COLUMNS}' for each pose")
-    stamps, x, y, _, qx, qy, qz, qw = np.array(table).T
-    check_increasing(path, numbers, stamps)
+    kept, remarks = in_order(path, numbers, [row[0] for row in table], [row[1:] for row in table])
+    stamps, x, y, _, qx, qy, qz, qw = np.array([table[i] for i in kept]).T
+    nanoseconds = in_nanoseconds(stamps)
+    if nanoseconds:
+        stamps = 1e-9 * stamps
+        remarks.append(f"{path.name}: its timestamps are nanoseconds, and were read as such")
     yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
-    return Trajectory(stamps, np.stack([x, y], axis=-1), np.unwrap(yaw))
+    trajectory = Trajectory(stamps, np.stack([x, y], axis=-1), np.unwrap(yaw))
+    return TrajectoryFile(trajectory, np.array(numbers)[kept], nanoseconds, remarks)
 
 
-def check_increasing(path: Path, numbers: list[int], stamps: np.ndarray) -> None:
-    """Refuse stamps that repeat or run backwards, by the number of the line."""
-    for i in np.flatnonzero(np.diff(stamps) <= 0)[:1]:
-        fault = "repeats" if stamps[i + 1] == stamps[i] else "runs back behind"
-        raise InputError(
-            f"{path}, line {numbers[i + 1]}: the timestamp {stamps[i + 1]:.6f} {fault} "
-            f"{stamps[i]:.6f} of the row before; timestamps must increase"
+def in_order(
+    path: Path, numbers: list[int], stamps: list[float], values: list
+) -> tuple[list[int], list[str]]:
+    """Which rows to keep: of several with one stamp and one value the first.
+
+    **Arguments:**
+    - `numbers`: the line of each row.
+    - `values`: what each row says of its stamp.
+
+    **Returns:** their indices, and remarks on what was dropped.
+
+    **Raises:** `InputError` with all lines that say different things of one stamp, or with the
+    line whose stamp runs back.
+    """
+    first: dict[float, int] = {}
+    kept, dropped, torn = [], [], []
+    for i, stamp in enumerate(stamps):
+        before = first.setdefault(stamp, i)
+        if before == i:
+            kept.append(i)
+        elif values[i] == values[before]:
+            dropped.append(numbers[i])
+        else:
+            torn += [numbers[before], numbers[i]]
+    if torn:
+        torn = sorted(set(torn))
+        few = ", ".join(map(str, torn[:MANY])) + f" and {len(torn) - MANY} more" * (
+            len(torn) > MANY
         )
+        raise InputError(
+            f"{path}, lines {few}: a timestamp repeats with another value; each must stand there "
+            "once"
+        )
+    for before, after in itertools.pairwise(kept):
+        if stamps[after] < stamps[before]:
+            raise InputError(
+                f"{path}, line {numbers[after]}: the timestamp {stamps[after]:.6f} runs back behind "
+                f"{stamps[before]:.6f} of the row before; timestamps must increase"
+            )
+    remark = f"{path.name}: {len(dropped)} rows repeat another and were dropped"
+    return kept, [f"{remark}, line {dropped[0]} first"] if dropped else []
+
+
+def in_nanoseconds(stamps: np.ndarray) -> bool:
+    """Whether stamps are counts of nanoseconds: no log has its rows, or its age, in such seconds."""
+    apart = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    return apart >= 1e5 or abs(float(stamps[0])) >= 1e15
 
 
 def _pose(where: str, line: str) -> list[float]:

@@ -51,7 +51,8 @@ def narrowed(frames: Keyframes, width: int) -> Keyframes:
     segments = frames.segments_image
     ends = jnp.take_along_axis(segments.endpoints, order[..., None, None], axis=1)
     seen = Segments(ends, take(segments.valid))
-    return Keyframes(seen, take(frames.line), take(frames.known), frames.motion, frames.way)
+    read = frames.motion, frames.way, frames.unknown
+    return Keyframes(seen, take(frames.line), take(frames.known), *read)
 
 
 def filled(index: np.ndarray, size: int) -> np.ndarray:
@@ -72,8 +73,12 @@ def _gather(log, index, count):
     real = jnp.arange(index.shape[0]) < count
     segments = Segments(segments.endpoints, segments.valid & real[:, None])
     none = jnp.zeros(segments.valid.shape, int)
-    way = totals[index] - totals[before]
-    return Keyframes(segments, none, none > 0, at(before).between(at(index)), way)
+    since = lambda totals: totals[index] - totals[before]
+    unknown = None
+    if log.motion_sigma is not None:
+        unknown = since(jnp.cumsum(log.motion_sigma**2, axis=0))
+    moved = at(before).between(at(index))
+    return Keyframes(segments, none, none > 0, moved, since(totals), unknown)
 
 
 def carry(T_world_robot: SE2, index: np.ndarray, smoothed: SE2) -> SE2:

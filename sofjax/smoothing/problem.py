@@ -25,6 +25,7 @@ class Keyframes(eqx.Module):
     known: Bool[Array, "n M"]  # whether it shows any
     motion: SE2  # [n] odometer since the keyframe before; the first is not used
     way: Float[Array, "n 3"]  # metres driven, radians turned left and (negative) right, as read
+    unknown: Float[Array, "n 3"] | None = None  # variance of what the odometer did not tell of it
 
     @property
     def driven(self) -> Float[Array, "n"]:
@@ -122,10 +123,11 @@ def robust(r: Float[Array, "d"], scale: Float[Array, ""] | float) -> Float[Array
 def odometer_residual(
     problem: Problem, before: Float[Array, "5"], after: Float[Array, "5"],
     shared: Float[Array, "8"], motion: SE2, way: Float[Array, "3"],
+    unknown: Float[Array, "3"] | None = None,
 ) -> Float[Array, "3"]:  # fmt: skip
     """Motion against reading, (forward, sideways, turn), by the motion model's noise."""
     moved = SE2(before[:2], before[2]).between(SE2(after[:2], after[2])).log()
-    sigma = odometer_sigma(problem.motion_model, way, LEAST)
+    sigma = odometer_sigma(problem.motion_model, way, LEAST, unknown)
     return (moved - read_twist(motion, way, shared[4:])) / sigma
 
 
@@ -156,10 +158,10 @@ def residuals(unknowns: Unknowns, problem: Problem) -> Residuals:
 
     r = distances(unknowns, problem) / priors.pixel_sigma
     pixels = jax.vmap(jax.vmap(robust, in_axes=(0, None)), in_axes=(0, None))(r, priors.loss_scale)
-    odometer = jax.vmap(odometer_residual, in_axes=(None, 0, 0, None, 0, 0))(
-        problem, unknowns.pose[:-1], unknowns.pose[1:], unknowns.shared,
-        jax.tree.map(lambda a: a[1:], k.motion), k.way[1:],
-    )  # fmt: skip
+    read = jax.tree.map(lambda a: a[1:], (k.motion, k.way, k.unknown))
+    odometer = jax.vmap(odometer_residual, in_axes=(None, 0, 0, None, 0, 0, 0))(
+        problem, unknowns.pose[:-1], unknowns.pose[1:], unknowns.shared, *read
+    )
     first = (unknowns.pose[:1, :3] - problem.start.pose[:1, :3]) / 1e-4
     kappa_sigma = jnp.where(problem.raised, priors.kappa_sigma, FIXED)
     loose = jnp.full_like(kappa_sigma, 10.0)  # keeps a line that nobody sees where it is

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
+from sofjax.motion import without_unread_motions
 from sofjax.observation import Observation
 from sofjax.segment_map import FinalMap, MapRules, SegmentMap, is_raised, on_floor
 from sofjax.slam import SlamConfig
@@ -99,6 +100,7 @@ def smooth(
     **Returns:** the last round's solution; `solution.converged` says whether it settled.
     """
     priors = _priors(config, rules)
+    log = without_unread_motions(config.motion, log)
     with jax.enable_x64(True):
         config, camera, mount, log, path, segment_map, rules, priors = map(
             _in_double, (config, camera, mount, log, path, segment_map, rules, priors)

@@ -10,9 +10,13 @@ import numpy as np
 
 from sofjax.geometry import Segments
 from sofjax.io.camera_file import CameraFile, horizon_image
+from sofjax.io.drive import Drive
 from sofjax.vision.detectors import DETECTORS, Detector
-from sofjax.vision.images import read_image
+from sofjax.vision.images import FULL, largest_value, read_image
 from sofjax.vision.lens import Lens
+
+NO_IMAGE, OTHER_SIZE = "cannot be read", "has another size than the camera's"
+REPEATED = "repeats the image before while the robot moves"
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,12 @@ class View:
     segments_image: Segments  # capacity M, pixels of the undistorted image
     overflow: int  # segments that found no place
     detected: int  # segments before packing
-    readable: bool  # whether the file held an image of the camera's size
+    fault: str  # why it tells nothing: no image, of another size, or the last one again; "" if it does
     seconds: dict[str, float]  # of each stage
+
+    @property
+    def readable(self) -> bool:
+        return not self.fault
 
 
 class Frontend:
@@ -41,15 +49,35 @@ class Frontend:
         camera_file: CameraFile,
         settings: FrontendSettings | None = None,
         detector: Detector | None = None,
+        white: int | None = None,
     ):
-        """`detector`: one's own, in the place of the one that the settings name."""
+        """**Arguments:**
+        - `detector`: one's own, in the place of the one that the settings name.
+        - `white`: of images of 16 bits, as of `read_image`.
+        """
         cv2.setNumThreads(1)
         self.settings = settings or FrontendSettings()
         self.detector = detector or DETECTORS[self.settings.detector]
         self.camera_file = camera_file
+        self.white = white
         self.lens = Lens(camera_file)
         mount = camera_file.mount
         self._horizon = horizon_image(self.lens.K, float(mount.pitch), float(mount.roll))
+
+    @classmethod
+    def of(cls, drive: Drive, settings: FrontendSettings | None = None) -> "Frontend":
+        """For the images of a drive, once it is known that there are some and what is white.
+
+        **Raises:** `InputError` if none of the images is one of the camera's.
+        """
+        return cls(drive.camera_file, settings, white=largest_value(drive))
+
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences on how the images are read."""
+        if self.white in (None, FULL):
+            return []
+        return [f"the images have 16 bits; their largest value, {self.white}, is taken as white"]
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
         """The image [height, width] as a pinhole camera with the same K would have taken it."""
@@ -64,11 +92,10 @@ class Frontend:
     def view(self, path: Path) -> View:
         """One image's file, decoded, undistorted, searched and packed."""
         clock = [time.perf_counter()]
-        image = read_image(path)
+        image = read_image(path, self.white)
         clock.append(time.perf_counter())
-        camera = self.camera_file.camera
-        readable = image is not None and image.shape == (camera.height, camera.width)
-        if readable:
+        fault = self._fault(image)
+        if not fault:
             image = self.undistort(image)
             clock.append(time.perf_counter())
             segments = self.detect(image)
@@ -80,7 +107,13 @@ class Frontend:
         clock.append(time.perf_counter())
         stages = ("decode", "undistort", "detect")
         seconds = dict(zip(stages, np.diff(clock).tolist(), strict=True))
-        return View(packed, overflow, len(segments), readable, seconds)
+        return View(packed, overflow, len(segments), fault, seconds)
+
+    def _fault(self, image: np.ndarray | None) -> str:
+        camera = self.camera_file.camera
+        if image is None:
+            return NO_IMAGE
+        return "" if image.shape == (camera.height, camera.width) else OTHER_SIZE
 
     def _length_on_floor(self, segments: np.ndarray) -> np.ndarray:
         """[S] pixels of each segment below the horizon, nearly: the rest cannot be floor."""

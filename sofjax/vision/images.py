@@ -8,34 +8,66 @@ import numpy as np
 from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 
+FULL = 255  # the white of 8 bits
 
-def read_image(path: Path) -> np.ndarray | None:
+
+def read_image(path: Path, white: int | None = None) -> np.ndarray | None:
     """The image in grey, [height, width] uint8; None if there is none that can be read.
 
     The turn that a file's EXIF asks for is not made: the calibration is of the sensor's pixels.
+
+    **Arguments:**
+    - `white`: the value of 16 bits that becomes 255, as a camera of 10 or 12 bits fills them only
+      in part; by default the image's largest.
     """
+    image = decode(path)
+    if image is None or image.dtype == np.uint8:
+        return image
+    white = max(int(image.max()) if white is None else white, 1)
+    return np.rint(np.minimum(image, white) * np.float32(FULL / white)).astype(np.uint8)
+
+
+def decode(path: Path) -> np.ndarray | None:
+    """The image in grey as it is stored, [height, width] uint8 or uint16; None if there is none."""
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        data = np.fromfile(path, np.uint8)
-        return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)
     except (OSError, cv2.error):
         return None
+    return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 
-def check_images(drive: Drive) -> None:
-    """Refuse a drive whose images none can read, or whose first one is not the camera's."""
+def largest_value(drive: Drive) -> int:
+    """What is white in the images of a drive: 255, or of 16 bits the largest value of them all.
+
+    **Raises:** `InputError` if none of the images is one of the camera's.
+    """
     camera = drive.camera_file.camera
+    other = None
     for file in drive.image_files:
-        image = read_image(file)
+        image = decode(file)
         if image is None:
             continue
-        height, width = image.shape
-        if (width, height) != (camera.width, camera.height):
-            raise InputError(
-                f"{file}: the image has {width}x{height} pixels and camera.yaml is for "
-                f"{camera.width}x{camera.height}; the camera must be that of the images"
-            )
-        return
-    raise InputError(
-        f"{drive.path / 'rgb.txt'}: none of its {len(drive.image_files)} images can be read; they "
-        "must be image files such as JPEG or PNG"
+        if image.shape == (camera.height, camera.width):
+            break
+        other = other or (file, image.shape)
+    else:
+        raise InputError(_none_usable(drive, other))
+    if image.dtype == np.uint8:
+        return FULL
+    stored = (decode(file) for file in drive.image_files)
+    return max(int(image.max()) for image in stored if image is not None)
+
+
+def _none_usable(drive: Drive, other: tuple[Path, tuple[int, int]] | None) -> str:
+    camera = drive.camera_file.camera
+    if other is None:
+        return (
+            f"{drive.path / 'rgb.txt'}: none of its {len(drive.image_files)} images can be read; "
+            "they must be image files such as JPEG or PNG"
+        )
+    file, (height, width) = other
+    return (
+        f"{file}: the image has {width}x{height} pixels and camera.yaml is for "
+        f"{camera.width}x{camera.height}; the camera must be that of the images"
     )

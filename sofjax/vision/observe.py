@@ -1,29 +1,71 @@
 """From images and odometry to what the filter takes."""
 
-from collections.abc import Callable, Iterable
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sofjax.geometry import SE2
-from sofjax.io.drive import Drive, motions
+from sofjax.geometry import SE2, Segments
+from sofjax.io.drive import Drive, motion_sigmas, motions
 from sofjax.observation import Observation
-from sofjax.vision.frontend import Frontend, View
+from sofjax.vision.frontend import REPEATED, Frontend, View
+
+MOVED_XY, MOVED_YAW = 0.01, 0.01  # metres and radians, beyond which an image cannot stay the same
 
 
-def observation(view: View, motion: np.ndarray) -> Observation:
+def observation(view: View, motion: np.ndarray, sigma: np.ndarray | None = None) -> Observation:
     """One image's observation.
 
     **Arguments:**
     - `view`: the image's segments.
     - `motion`: [3], T_previous_current of the odometer as (dx, dy, dyaw), metres and radians.
+    - `sigma`: [3], what is not known of it beyond the odometer's noise.
     """
     return Observation(
         segments_image=view.segments_image,
         motion=SE2(jnp.asarray(motion[:2], float), jnp.asarray(motion[2], float)),
         overflow=jnp.asarray(view.overflow, int),
+        motion_sigma=None if sigma is None else jnp.asarray(sigma, float),
     )
+
+
+def observations(drive: Drive, views: Iterable[View]) -> Iterator[tuple[View, Observation]]:
+    """Each view of a drive with its observation; a view that repeats the last one is emptied."""
+    steps, sigmas = motions(drive), motion_sigmas(drive)
+    for i, view in enumerate(without_repeats(views, steps)):
+        yield view, observation(view, steps[i], None if sigmas is None else sigmas[i])
+
+
+def without_repeats(views: Iterable[View], steps: np.ndarray) -> Iterator[View]:
+    """Views in order; one that shows the very segments of the last although the robot has moved
+    since tells nothing: a camera, or its driver, is stuck.
+
+    **Arguments:**
+    - `steps`: [T, 3], the odometer's motion up to each image.
+    """
+    last, xy, yaw = None, 0.0, 0.0
+    for view, (dx, dy, turn) in zip(views, steps, strict=True):
+        xy, yaw = xy + float(np.hypot(dx, dy)), yaw + abs(float(turn))
+        if last is not None and _same(view, last):
+            if xy > MOVED_XY or yaw > MOVED_YAW:
+                view = _emptied(view)
+        elif view.detected:
+            last, xy, yaw = view, 0.0, 0.0
+        yield view
+
+
+def _same(a: View, b: View) -> bool:
+    first, second = (np.asarray(view.segments_image.endpoints) for view in (a, b))
+    return 0 < a.detected == b.detected and np.array_equal(first, second)
+
+
+def _emptied(view: View) -> View:
+    none = Segments(
+        jnp.zeros_like(view.segments_image.endpoints), jnp.zeros_like(view.segments_image.valid)
+    )
+    return dataclasses.replace(view, segments_image=none, overflow=0, detected=0, fault=REPEATED)
 
 
 def observe_drive(
@@ -33,8 +75,6 @@ def observe_drive(
 
     An image that cannot be read is one without segments. `progress` wraps the loop over the images.
     """
-    each = [
-        observation(frontend.view(file), motion)
-        for file, motion in zip(progress(drive.image_files), motions(drive), strict=True)
-    ]
+    views = (frontend.view(file) for file in progress(drive.image_files))
+    each = [observed for _, observed in observations(drive, views)]
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each)

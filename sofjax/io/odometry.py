@@ -1,0 +1,258 @@
+"""What an odometer's rows cannot mean: jumps, restarts, stalls and holes, found and taken out.
+
+A wheel odometer is trusted from row to row, so one row that is no motion moves the whole path
+behind it. Here such rows are found by the odometer's own usual speed, the path is mended, and the
+time over which the motion is not known is told to whoever uses it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sofjax.io.trajectory import Trajectory
+
+MIN_ROWS = 8  # below which there is no usual speed
+USUAL = 0.8  # quantile of the speeds of a robot that moves
+MOVING = 0.02  # metres and radians a second, above which it does
+FASTER = 5.0  # times its usual speed, beyond which a step is no motion ...
+SPEED, TURN_RATE = 1.0, 3.0  # ... nor where it is below this: metres, radians a second
+SLACK_XY, SLACK_YAW = 0.05, np.deg2rad(5)  # of a step, metres and radians
+HOLE_PERIODS, HOLE_SECONDS = 5.0, 0.5  # without a row, beyond which what lies between is not known
+STALE_PERIODS = 2.5  # of one and the same pose ...
+CAUGHT_UP = 0.6  # ... if the next step is this share of what was to be driven in that time
+ZERO = 0.02  # metres and radians about the origin: where an odometer restarts ...
+FROM = 0.3  # ... if it comes from so far away in one step
+FASTEST = 60.0  # metres a second; no wheeled robot
+SHARE = 0.5  # of the usual speed: standard deviation of the speed that is not known
+MIN_TURN_RATE = 0.3  # radians a second, standard deviation of a turn rate that is not known
+CORRELATED = 1.0  # seconds over which an unknown speed stays what it is
+STRETCH = 0.1  # metres over which a direction of travel is told
+LEAST = 0.02  # metres and radians, standard deviation of a motion that nobody read
+
+
+@dataclass(frozen=True)
+class Outage:
+    """A time over which the odometry does not tell the robot's motion."""
+
+    begin: float  # seconds
+    end: float
+    bridged: bool  # whether the poses at its two ends are still of one path
+    sentence: str  # what was found, with its line
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """How fast a robot usually moves; zero where it does not."""
+
+    forward: float  # metres a second
+    turn: float  # radians a second
+
+
+def mend(where: str, lines: np.ndarray, read: Trajectory) -> tuple[Trajectory, list[Outage]]:
+    """The odometry without what is no motion, and the times over which the motion is not known.
+
+    - A pose that stands still and then catches up (a driver that stalls): its stale rows go.
+    - A hole in the rows, and what a stall leaves: the straight line between its ends stays.
+    - A jump, or a restart at the origin: the path goes on behind it at the speed around it.
+
+    Where nothing of this is found the trajectory is returned as it is.
+
+    **Arguments:**
+    - `where`: the file, for the sentences.
+    - `lines`: [n], the line of each row.
+    """
+    if len(read.stamps) < MIN_ROWS:
+        return read, []
+    fresh = ~_stale(read)
+    lines, mended = lines[fresh], read
+    if not fresh.all():
+        mended = Trajectory(read.stamps[fresh], read.xy[fresh], np.unwrap(read.yaw[fresh]))
+    dt, way, turn = _steps(mended)
+    speeds = usual_speeds(mended)
+    period = float(np.median(np.diff(read.stamps)))
+    hole = dt > max(HOLE_PERIODS * period, HOLE_SECONDS)
+    restart = _restarts(mended)
+    jump = restart | _too_far(dt, way, turn, speeds, period)
+
+    outages = []
+    for i in np.flatnonzero(hole | jump):
+        begin, end = float(mended.stamps[i]), float(mended.stamps[i + 1])
+        at = f"{where}, line {lines[i + 1]}"
+        if restart[i]:
+            what = f"the odometry restarts at the origin, {way[i]:.2f} m from the row before"
+        elif jump[i]:
+            usual = f"usually {speeds.forward:.2f} m and {np.degrees(speeds.turn):.0f}° a second"
+            what = (
+                f"a step of {way[i]:.2f} m and {np.degrees(turn[i]):.0f}° in {dt[i]:.3f} s "
+                f"({usual})"
+            )
+        elif not fresh[np.searchsorted(read.stamps, begin) + 1]:
+            what = f"the pose stands still for {dt[i]:.2f} s from {begin:.2f} s on, then catches up"
+        else:
+            what = f"no row for {dt[i]:.2f} s from {begin:.2f} s on"
+        outages.append(Outage(begin, end, not jump[i], f"{at}: {what}"))
+    return (_without(mended, jump) if jump.any() else mended), outages
+
+
+def usual_speeds(trajectory: Trajectory) -> Speeds:
+    """The speeds below which it is for four fifths of the time that it moves."""
+    dt, way, turn = _steps(trajectory)
+
+    def usual(rate: np.ndarray) -> float:
+        moving = rate[rate > MOVING]
+        return float(np.quantile(moving, USUAL)) if len(moving) else 0.0
+
+    return Speeds(usual(way / dt), usual(turn / dt))
+
+
+def unknown_motion(
+    outages: list[Outage], speeds: Speeds, stamps: np.ndarray
+) -> np.ndarray | None:
+    """What is not known of the motion up to each image, as standard deviations; None if nothing.
+
+    In an outage the robot's speed may be off by half the usual one, and stays so for a second; if
+    both ends are known, only the way between them is not (a Brownian bridge).
+
+    **Arguments:**
+    - `stamps`: [T] of the images, seconds.
+
+    **Returns:** [T, 3] forward, sideways (metres) and turn (radians); zero where all is known.
+    """
+    variance = np.zeros((len(stamps), 3))
+    rate = np.array([SHARE * speeds.forward] * 2 + [max(SHARE * speeds.turn, MIN_TURN_RATE)])
+    for outage in outages:
+        seconds = outage.end - outage.begin
+        edges = np.clip(stamps, outage.begin, outage.end)
+        share = np.diff(edges, prepend=edges[:1]) / seconds
+        left = share * (1 - share) if outage.bridged else share
+        variance += left[:, None] * rate**2 * seconds * min(seconds, CORRELATED)
+        if not outage.bridged:
+            variance += share[:, None] * LEAST**2
+    return np.sqrt(variance) if variance.any() else None
+
+
+def contradictions(
+    where: str, lines: np.ndarray, read: Trajectory, mended: Trajectory
+) -> list[str]:
+    """Sentences on what shows that the odometry as a whole is not what it must be.
+
+    **Arguments:** as of `mend`, and what that returned.
+    """
+    dt, way, _ = _steps(read)
+    found = []
+    speed = way / dt
+    if len(speed) and np.median(speed[way > 0] if way.any() else speed) > FASTEST:
+        i = int(np.flatnonzero(speed > FASTEST)[0])
+        found.append(
+            f"{where}, line {lines[i + 1]}: {way[i]:.4g} m in {dt[i]:.3f} s are "
+            f"{speed[i]:.4g} m/s, which no wheeled robot drives; are positions in millimetres?"
+        )
+    share, angle = _direction_of_travel(mended)
+    if share is None:
+        return found
+    if share < 0.7:
+        found.append(
+            f"{where}: the heading does not follow the direction of travel; is the yaw in degrees, "
+            "of the wrong sign, or are x and y swapped?"
+        )
+    elif abs(angle) > np.deg2rad(135):
+        found.append(
+            f"{where}: the robot drives backwards by its heading; is the sign of x and y or the "
+            "heading reversed? The camera must look forward along the robot's x axis"
+        )
+    elif abs(angle) > np.deg2rad(30):
+        found.append(
+            f"{where}: the robot drives {np.degrees(angle):.0f}° to the side of its heading; are x "
+            "and y swapped? The heading must be that of the robot's x axis, which points forward"
+        )
+    return found
+
+
+def _steps(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Seconds, metres and radians (both positive) from each row to the next."""
+    way = np.hypot(*np.diff(trajectory.xy, axis=0).T)
+    return np.diff(trajectory.stamps), way, np.abs(np.diff(trajectory.yaw))
+
+
+def _stale(trajectory: Trajectory) -> np.ndarray:
+    """[n] bool, rows that repeat the pose before while the robot drove on, as what follows shows."""
+    dt, way, turn = _steps(trajectory)
+    stale = np.zeros(len(trajectory.stamps), bool)
+    still = (way == 0) & (turn == 0)
+    edges = np.diff(np.concatenate([[0], still.astype(int), [0]]))
+    period = float(np.median(dt))
+    for begin, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        if begin == 0 or end == len(dt):  # nothing before or behind tells
+            continue
+        seconds = trajectory.stamps[end + 1] - trajectory.stamps[begin]
+        caught_up = any(
+            step[begin - 1] > 0
+            and step[end] > CAUGHT_UP * step[begin - 1] / dt[begin - 1] * seconds
+            for step in (way, turn)
+        )
+        if seconds - dt[end] > STALE_PERIODS * period and caught_up:
+            stale[begin + 1 : end + 1] = True
+    return stale
+
+
+def _too_far(
+    dt: np.ndarray, way: np.ndarray, turn: np.ndarray, speeds: Speeds, period: float
+) -> np.ndarray:
+    """[n - 1] bool, steps far longer than the robot's usual speed and that around them allow."""
+    around = np.lib.stride_tricks.sliding_window_view
+    longer = np.maximum(dt, period)
+
+    def beyond(step: np.ndarray, usual: float, least: float, slack: float) -> np.ndarray:
+        local = np.median(around(np.pad(step / dt, 3, mode="edge"), 7), axis=1)
+        fast = np.maximum(FASTER * np.maximum(usual, local), least)
+        return step > fast * longer + slack
+
+    return beyond(way, speeds.forward, SPEED, SLACK_XY) | beyond(
+        turn, speeds.turn, TURN_RATE, SLACK_YAW
+    )
+
+
+def _restarts(trajectory: Trajectory) -> np.ndarray:
+    """[n - 1] bool, steps that end where odometers begin and come from far away."""
+    pose = np.column_stack([trajectory.xy, np.angle(np.exp(1j * trajectory.yaw))])
+    at_origin = (np.abs(pose) < ZERO).all(1)
+    _, way, _ = _steps(trajectory)
+    return at_origin[1:] & ~at_origin[:-1] & (way > FROM)
+
+
+def _without(trajectory: Trajectory, jump: np.ndarray) -> Trajectory:
+    """The path with the steps marked replaced by the speed of those around them."""
+    dt = np.diff(trajectory.stamps)
+    c, s = np.cos(trajectory.yaw[:-1]), np.sin(trajectory.yaw[:-1])
+    dx, dy = np.diff(trajectory.xy, axis=0).T
+    steps = np.stack([c * dx + s * dy, c * dy - s * dx, np.diff(trajectory.yaw)], axis=1)
+    known = np.flatnonzero(~jump)
+    for i in np.flatnonzero(jump):
+        near = known[np.abs(known - i) <= 3]
+        usual = np.median(steps[near] / dt[near, None], axis=0) if len(near) else np.zeros(3)
+        steps[i] = usual * dt[i]
+    yaw = trajectory.yaw[0] + np.append(0.0, np.cumsum(steps[:, 2]))
+    c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
+    moved = np.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]], axis=1)
+    xy = trajectory.xy[0] + np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    return Trajectory(trajectory.stamps, xy, yaw)
+
+
+def _direction_of_travel(trajectory: Trajectory) -> tuple[float | None, float]:
+    """How much the angle between heading and travel is one and the same, 0 to 1, and that angle.
+
+    Over stretches of `STRETCH` metres, so that a robot that stands and trembles has none; of fewer
+    than five nothing can be said: then None.
+    """
+    xy, chosen = trajectory.xy, [0]
+    for i, (x, y) in enumerate(xy.tolist()):
+        x0, y0 = xy[chosen[-1]]
+        if (x - x0) ** 2 + (y - y0) ** 2 > STRETCH**2:
+            chosen.append(i)
+    if len(chosen) < 6:
+        return None, 0.0
+    dx, dy = np.diff(xy[chosen], axis=0).T
+    yaw = trajectory.yaw[chosen]
+    along = (dx + 1j * dy) * np.exp(-0.5j * (yaw[:-1] + yaw[1:]))
+    mean = along.sum() / np.abs(along).sum()
+    return float(np.abs(mean)), float(np.angle(mean))
