@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sofjax.io.errors import InputError
-from sofjax.io.trajectory import Trajectory
+from sofjax.io.trajectory import Trajectory, gaps
 
 SLACK = 0.06  # seconds that a true pose may lie beyond the estimate's ends
+NEAR_IN_TIME = 0.75  # of the usual time between estimates, from one of them; in a gap of theirs
 SPACING = 0.02  # metres between the samples of a map
 NEAR = 0.05  # metres from a true line within which a sample is right ...
 PARALLEL = np.deg2rad(5)  # ... if its direction is this near too
@@ -68,9 +69,14 @@ def align(points: np.ndarray, onto: np.ndarray) -> RigidMotion:
 
 
 def shared(truth: Trajectory, estimate: Trajectory) -> Trajectory:
-    """The true poses in the time that the estimate spans."""
+    """The true poses in the time that the estimate spans, those in its gaps left out: an estimate
+    that is interpolated over a gap is nobody's."""
     begin, end = estimate.stamps[0] - SLACK, estimate.stamps[-1] + SLACK
     span = (truth.stamps >= begin) & (truth.stamps <= end)
+    usual = float(np.median(np.diff(estimate.stamps))) if len(estimate.stamps) > 1 else 0.0
+    slack = max(SLACK, NEAR_IN_TIME * usual)
+    for begin, seconds in gaps(estimate.stamps):
+        span &= (truth.stamps <= begin + slack) | (truth.stamps >= begin + seconds - slack)
     if span.sum() < 2:
         raise InputError(
             f"the trajectory ({estimate.span()}) and the true path ({truth.span()}) must share the "

@@ -13,6 +13,8 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
 from sofjax.observation import Observation
 
+BIAS = ("distance", "left", "right", "curvature")  # names of the systematic errors b
+
 
 class MotionModel(eqx.Module):
     """How an odometer errs: noise that grows with the way, and systematic errors with priors.

@@ -93,8 +93,8 @@ def empty_window(rules: WindowRules, capacity: int, sightings: Sightings) -> Win
 def slide(
     rules: WindowRules, map_rules: MapRules, sensor: SensorModel, model: MotionModel,
     window: Window, segment_map: SegmentMap, T_robot_foot: SE2, odometer: SE2,
-    unknown: Float[Array, "3"], T_world_robot: SE2, tilt: Float[Array, "2"], bias: OdometerBias, sightings: Sightings,
-    new: Int[Array, "M"], reach: Float[Array, ""] | float,
+    unknown: Float[Array, "3"], T_world_robot: SE2, tilt: Float[Array, "2"], bias: OdometerBias,
+    sightings: Sightings, new: Int[Array, "M"], reach: Float[Array, ""] | float,
 ) -> tuple[Window, SegmentMap, SE2]:  # fmt: skip
     """Take an image into account; if it is a keyframe, solve for the window that it ends.
 

@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, detect, fit, judge, draw, write."""
     from sofjax.cli import mount_figure, outputs
     from sofjax.io.drive import read_drive
-    from sofjax.vision import FrontendSettings, check_images
+    from sofjax.vision import FrontendSettings
 
     free = free_names(args.free)
     if args.joint and "distance" in free:
@@ -73,7 +73,6 @@ def run(args: argparse.Namespace) -> int:
     if args.out.is_dir():
         raise InputError(f"{args.out}: is a folder; -o must name a file, such as camera.yaml")
     drive = begin_at(read_drive(args.drive), args.initial)
-    check_images(drive)
     outputs.check_writable(args.out.parent)
     found = calibrate(drive, FrontendSettings(), free, args.joint)
     print(found.summary)
@@ -172,7 +171,7 @@ def calibrate(
             f"{math.degrees(turned):.1f}° in all; a mount can only be fitted to a drive of some "
             "metres"
         )
-    log = observed(drive, Frontend(drive.camera_file, settings))
+    log = observed(drive, Frontend.of(drive, settings))
     # the odometer's turning errs more than anything; its distance is the measure of the height
     rules = DriveRules(fit=FitRules(free=tuple(dict.fromkeys([*free, *TURNS]))))
     with jax.enable_x64(True):

@@ -1,5 +1,7 @@
 """Errors against the truth as lines for a person."""
 
+import math
+
 from sofjax.evaluation import MapErrors, TrajectoryErrors
 
 ROWS = (
@@ -21,17 +23,22 @@ def errors_table(
     """Lines that set the estimates beside the odometry, and the map below."""
     columns = [("sofjax", trajectory), ("smoothed", smoothed), ("odometry", odometry)]
     columns = [(name, errors) for name, errors in columns if errors]
-    heads = "".join(f"{name:>10}" for name, _ in columns)
-    lines = [f"  against the truth, aligned without scale{heads}"]
+    table = [("against the truth, aligned without scale", [name for name, _ in columns])]
     for name, label, form in ROWS:
-        values = "".join(f"{form.format(getattr(errors, name)):>10}" for _, errors in columns)
-        lines.append(f"    {label:38}{values}")
+        values = [_number(form, getattr(errors, name)) for _, errors in columns]
+        table.append((f"  {label}", values))
     if trajectory.coverage < 0.99:
-        lines.append(f"    {'share of the true path':38}{trajectory.coverage:>10.2f}")
+        table.append(("  share of the true path", [f"{trajectory.coverage:.2f}"]))
     if of_map:
-        lines += [
-            f"    {'map, precision':38}{of_map.precision:>10.2f}",
-            f"    {'map, recall':38}{of_map.recall:>10.2f}",
-            f"    {'map, error':38}{1e3 * of_map.error_m:>7.1f} mm",
+        table += [
+            ("  map, precision", [f"{of_map.precision:.2f}"]),
+            ("  map, recall", [f"{of_map.recall:.2f}"]),
+            ("  map, error", [_number("{:.1f} mm", 1e3 * of_map.error_m)]),
         ]
-    return lines
+    width = max(10, 2 + max(len(value) for _, values in table for value in values))
+    return [f"  {label:40}" + "".join(f"{v:>{width}}" for v in values) for label, values in table]
+
+
+def _number(form: str, value: float) -> str:
+    """With its unit; a dash for what cannot be said."""
+    return form.format(value) if math.isfinite(value) else "-"

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from sofjax import slam, viewer
+from sofjax import doubts, slam, viewer
 from sofjax.cli import outputs
 from sofjax.cli.errors_table import errors_table
 from sofjax.cli.settings import RunSettings
@@ -24,14 +24,22 @@ from sofjax.evaluation import (
     evaluate_trajectory,
     shared,
 )
-from sofjax.io.camera_file import doubts
-from sofjax.io.drive import Drive, outside
+from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 from sofjax.io.map_file import write_map
 from sofjax.io.settings import to_dict
 from sofjax.segment_map import final_map
 
 UNHELD = 5.0  # metres; R, within which a line across the way is mapped and holds the distance
+FUNNEL = {  # units, and what each count of it means
+    "images": "images: those that the filter took",
+    "segments": "segments: found in the images, after undistortion and of the least length",
+    "below_horizon": "segments: of these, on the floor's side of the horizon and within range",
+    "associated": "segments: of these, moving as the floor does between two images, by eq. (9)",
+    "matched": "segments: of these, showing a line that the map knew",
+    "born": "lines: begun in the map",
+    "mapped": "lines: in the final map, on the floor",
+}
 PACKAGES = ("sofjax", "jax", "jaxlib", "equinox", "numpy", "opencv-python-headless")
 
 
@@ -60,7 +68,8 @@ def write_results(
     interrupted: bool,
 ) -> Results:
     """Write the map and the figure, and compare with the truth where it is known."""
-    results = Results(np.zeros((0, 2, 2)), 0, interrupted, warnings(drive, tally), closed)
+    found = warnings(drive, tally) + doubts.odometer(tally.odometer, settings.slam.motion)
+    results = Results(np.zeros((0, 2, 2)), 0, interrupted, found, closed)
     seen, height = np.zeros(0, int), np.zeros(0)
     if state is not None:
         if closed is None:
@@ -144,13 +153,13 @@ def _ellipses(closed: Closed, to_truth: RigidMotion) -> tuple[np.ndarray, np.nda
 
 def warnings(drive: Drive, tally: Tally) -> list[str]:
     """Sentences on what was odd about the drive."""
-    found = doubts(drive.camera_file)
+    found = doubts.of_drive(drive)
+    found += doubts.set_up(tally.step["associated"], tally.step["below_horizon"])
     n = len(tally.stamps)
+    why = ", ".join(f"{len(files)} {fault}" for fault, files in tally.faults.items())
     for count, text in (
-        (len(tally.unreadable), "images could not be read as the camera's; the odometry bridged"),
+        (len(tally.unreadable), f"images could not be used ({why}); the odometry bridged them"),
         (tally.blind, "images had no segment at all; the odometry bridged them"),
-        (int(outside(drive.odometry, np.array(tally.stamps)).sum()), "images lie outside the time "
-         "of the odometry, and the robot was taken to stand still"),
         (tally.step["lost"], "images were lost: nothing seen was in the map for ten and more"),
     ):  # fmt: skip
         if count:
@@ -208,9 +217,10 @@ def write_report(
                 "segments": tally.detected,
                 "below_horizon": tally.step["below_horizon"],
                 "associated": tally.step["associated"],
-                "matched": tally.step["matched"],
+                "matched": tally.step["reobserved"],
                 "born": tally.step["born"],
                 "mapped": len(results.segments),
+                "meaning": FUNNEL,
             },
             "left_out": results.left_out,
             "overflow": {"segments": tally.overflow, "map": tally.step["map_overflow"]},
@@ -260,8 +270,9 @@ def summary(
     lines = [
         f"{drive.name}: {n} images, {way:.1f} m"
         + f"; interrupted before {len(drive.image_files) - n} more" * results.interrupted,
-        f"  segments  {tally.detected} found, {step['below_horizon']} on the floor's side of the "
-        f"horizon, {step['associated']} associated, {step['matched']} matched to the map",
+        f"  segments  {tally.detected} found, {step['below_horizon']} of them on the floor's side "
+        f"of the horizon, {step['associated']} of those",
+        f"            associated by eq. (9), {step['reobserved']} of those matched to the map",
         f"  map       {len(results.segments)} segments on the floor; {results.left_out} lines left "
         "out, above it or seen too little",
         *_closing(results.closed),

@@ -69,11 +69,12 @@ def run(args: argparse.Namespace) -> int:
     from sofjax.io.settings import to_dict, to_toml
     from sofjax.io.text import write_atomically
     from sofjax.io.trajectory import TrajectoryWriter
-    from sofjax.vision import Frontend, check_images
+    from sofjax.vision import Frontend
 
     settings = gather(args)
     drive = read_drive(args.drive)
-    check_images(drive)
+    frontend = Frontend.of(drive, settings.frontend)
+    drive = dataclasses.replace(drive, remarks=drive.remarks + frontend.remarks)
     folder = outputs.make_folder(args.out, drive.name)
     write_atomically(folder / outputs.CONFIG, to_toml(to_dict(settings)))
     fitted = None
@@ -82,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         if not fitted.usable:
             return calibrate_mount.REFUSED
         drive = dataclasses.replace(drive, camera_file=fitted.camera_file)
-    frontend = Frontend(drive.camera_file, settings.frontend)
+        frontend = Frontend(drive.camera_file, settings.frontend, bits=frontend.bits)
 
     tally, state, interrupted = Tally(), None, False
     started = time.perf_counter()
@@ -126,22 +127,20 @@ def steps(
     import jax
 
     from sofjax import slam
-    from sofjax.io.drive import motions
-    from sofjax.vision import observation
+    from sofjax.vision import observations
 
     config, camera, mount = settings.slam, drive.camera_file.camera, drive.camera_file.mount
     key = jax.random.key(settings.seed)
     state = slam.init(config, camera, mount, key, settings.frontend.capacity)
     with closing(views(frontend, drive.image_files)) as coming:
-        for motion in motions(drive):
-            begun = time.perf_counter()
-            view = next(coming)
+        begun = time.perf_counter()
+        for view, observed in observations(drive, coming):
             waited = time.perf_counter()
-            observed = observation(view, motion)
             state, info = slam.step(config, camera, mount, state, observed)
             info = jax.device_get(info)
             stepped = time.perf_counter()
             yield view, observed, info, {"wait": waited - begun, "step": stepped - waited}, state
+            begun = time.perf_counter()
 
 
 def views(frontend: "Frontend", files: list[Path]) -> Iterator["View"]:

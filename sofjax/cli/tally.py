@@ -1,5 +1,6 @@
 """What a run counts on its way through a drive."""
 
+import itertools
 from dataclasses import dataclass, field
 
 import jax
@@ -10,6 +11,7 @@ from sofjax.geometry import SE2
 from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory
+from sofjax.motion import BIAS
 from sofjax.observation import Observation
 from sofjax.segment_map import FinalMap
 from sofjax.slam import StepInfo
@@ -19,6 +21,7 @@ WARM = 10  # images that timing leaves out: the first one compiles
 OF_THE_STEP = (
     "below_horizon",
     "associated",
+    "reobserved",
     "matched",
     "born",
     "map_overflow",
@@ -37,7 +40,7 @@ class Tally:
     tilt: list[np.ndarray] = field(default_factory=list)  # (pitch, roll), radians
     across: list[int] = field(default_factory=list)  # matched lines that run across the way
     bias: np.ndarray | None = None  # the odometer's errors at last
-    unreadable: list[str] = field(default_factory=list)  # files
+    faults: dict[str, list[str]] = field(default_factory=dict)  # files that tell nothing, by why
     blind: int = 0  # images that were read and had no segment
     detected: int = 0  # segments
     overflow: int = 0  # segments that found no place in an observation
@@ -68,8 +71,9 @@ class Tally:
         self.tilt.append(info.tilt)
         self.across.append(int(info.across))
         self.bias = info.bias
-        if not view.readable:
-            self.unreadable.append(str(drive.image_files[i].relative_to(drive.path)))
+        if view.fault:
+            file = str(drive.image_files[i].relative_to(drive.path))
+            self.faults.setdefault(view.fault, []).append(file)
         self.blind += view.readable and view.detected == 0
         self.detected += view.detected
         self.overflow += view.overflow
@@ -77,6 +81,16 @@ class Tally:
             self.step[name] += int(getattr(info, name))
         self.seconds.append(view.seconds | seconds)
         self.done.append(now)
+
+    @property
+    def unreadable(self) -> list[str]:
+        """Files that tell nothing, in order."""
+        return sorted(itertools.chain(*self.faults.values()))
+
+    @property
+    def odometer(self) -> dict[str, float]:
+        """The odometer's errors as they were learned at last, by name."""
+        return dict(zip(BIAS, map(float, self.bias), strict=True)) if self.done else {}
 
     @property
     def trajectory(self) -> Trajectory:

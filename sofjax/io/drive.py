@@ -158,12 +158,10 @@ def odometry_warnings(drive: Drive) -> list[str]:
     """Sentences on where the odometry does not tell the motion, each with the images in it."""
     found = []
     for outage in drive.outages[:MANY]:
-        stamps = drive.image_stamps
-        images = int(((stamps > outage.begin) & (stamps <= outage.end)).sum())
-        between = "the motion in between" if outage.bridged else "the motion there"
-        found.append(
-            f"{outage.sentence}; {between} is taken as unknown ({images} images)"
-        )
+        edges = np.clip(drive.image_stamps, outage.begin, outage.end)
+        images = int((np.diff(edges) > 0).sum())
+        between = "what lies between" if outage.bridged else "the motion there"
+        found.append(f"{outage.sentence}; {between} is taken as unknown ({images} images)")
     if len(drive.outages) > MANY:
         found.append(f"odometry.txt: {len(drive.outages) - MANY} more such places")
     return found

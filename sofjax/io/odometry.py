@@ -25,7 +25,6 @@ FROM = 0.3  # ... if it comes from so far away in one step
 FASTEST = 60.0  # metres a second; no wheeled robot
 SHARE = 0.5  # of the usual speed: standard deviation of the speed that is not known
 MIN_TURN_RATE = 0.3  # radians a second, standard deviation of a turn rate that is not known
-CORRELATED = 1.0  # seconds over which an unknown speed stays what it is
 STRETCH = 0.1  # metres over which a direction of travel is told
 LEAST = 0.02  # metres and radians, standard deviation of a motion that nobody read
 
@@ -105,13 +104,11 @@ def usual_speeds(trajectory: Trajectory) -> Speeds:
     return Speeds(usual(way / dt), usual(turn / dt))
 
 
-def unknown_motion(
-    outages: list[Outage], speeds: Speeds, stamps: np.ndarray
-) -> np.ndarray | None:
+def unknown_motion(outages: list[Outage], speeds: Speeds, stamps: np.ndarray) -> np.ndarray | None:
     """What is not known of the motion up to each image, as standard deviations; None if nothing.
 
-    In an outage the robot's speed may be off by half the usual one, and stays so for a second; if
-    both ends are known, only the way between them is not (a Brownian bridge).
+    In an outage the robot's speed may be off by half the usual one; if both ends are known, the
+    whole of it is, and only the way between them is not (as of a Brownian bridge).
 
     **Arguments:**
     - `stamps`: [T] of the images, seconds.
@@ -121,13 +118,11 @@ def unknown_motion(
     variance = np.zeros((len(stamps), 3))
     rate = np.array([SHARE * speeds.forward] * 2 + [max(SHARE * speeds.turn, MIN_TURN_RATE)])
     for outage in outages:
-        seconds = outage.end - outage.begin
         edges = np.clip(stamps, outage.begin, outage.end)
-        share = np.diff(edges, prepend=edges[:1]) / seconds
-        left = share * (1 - share) if outage.bridged else share
-        variance += left[:, None] * rate**2 * seconds * min(seconds, CORRELATED)
-        if not outage.bridged:
-            variance += share[:, None] * LEAST**2
+        seconds = np.diff(edges, prepend=edges[:1])[:, None]
+        share = seconds / (outage.end - outage.begin)
+        variance += (rate * seconds) ** 2 * ((1 - share) if outage.bridged else 1)
+        variance += 0 if outage.bridged else share * LEAST**2
     return np.sqrt(variance) if variance.any() else None
 
 
@@ -175,7 +170,7 @@ def _steps(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _stale(trajectory: Trajectory) -> np.ndarray:
-    """[n] bool, rows that repeat the pose before while the robot drove on, as what follows shows."""
+    """[n] bool, rows that repeat the pose before while the robot drove on, as the next shows."""
     dt, way, turn = _steps(trajectory)
     stale = np.zeros(len(trajectory.stamps), bool)
     still = (way == 0) & (turn == 0)

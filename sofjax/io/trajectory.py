@@ -12,6 +12,7 @@ from sofjax.io.text import rows, write_atomically
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 HEAD = f"# T_world_robot: {COLUMNS}\n"
+GAP = 2.5  # times the usual time from stamp to stamp, beyond which some are missing
 MANY = 12  # lines that a sentence names
 
 
@@ -114,15 +115,24 @@ def in_order(
     for before, after in itertools.pairwise(kept):
         if stamps[after] < stamps[before]:
             raise InputError(
-                f"{path}, line {numbers[after]}: the timestamp {stamps[after]:.6f} runs back behind "
-                f"{stamps[before]:.6f} of the row before; timestamps must increase"
+                f"{path}, line {numbers[after]}: the timestamp {stamps[after]:.6f} runs back "
+                f"behind {stamps[before]:.6f} of the row before; timestamps must increase"
             )
     remark = f"{path.name}: {len(dropped)} rows repeat another and were dropped"
     return kept, [f"{remark}, line {dropped[0]} first"] if dropped else []
 
 
+def gaps(stamps: np.ndarray) -> list[tuple[float, float]]:
+    """(begin, seconds) of the times from one stamp to the next that are far longer than usual."""
+    steps = np.diff(stamps)
+    if not len(steps):
+        return []
+    long = np.flatnonzero(steps > GAP * np.median(steps))
+    return [(float(stamps[i]), float(steps[i])) for i in long]
+
+
 def in_nanoseconds(stamps: np.ndarray) -> bool:
-    """Whether stamps are counts of nanoseconds: no log has its rows, or its age, in such seconds."""
+    """Whether stamps are nanoseconds: in seconds no log is so slow, or so old."""
     apart = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     return apart >= 1e5 or abs(float(stamps[0])) >= 1e15
 

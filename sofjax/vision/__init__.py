@@ -16,6 +16,7 @@ from sofjax.vision.frontend import pack as pack
 from sofjax.vision.images import read_image as read_image
 from sofjax.vision.lens import Lens as Lens
 from sofjax.vision.observe import observation as observation
+from sofjax.vision.observe import observations as observations
 from sofjax.vision.observe import observe_drive as observe_drive
 from sofjax.vision.observe import without_repeats as without_repeats
 from sofjax.vision.rectify import rectify as rectify

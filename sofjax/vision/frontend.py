@@ -12,11 +12,11 @@ from sofjax.geometry import Segments
 from sofjax.io.camera_file import CameraFile, horizon_image
 from sofjax.io.drive import Drive
 from sofjax.vision.detectors import DETECTORS, Detector
-from sofjax.vision.images import FULL, largest_value, read_image
+from sofjax.vision.images import bit_depth, read_image
 from sofjax.vision.lens import Lens
 
-NO_IMAGE, OTHER_SIZE = "cannot be read", "has another size than the camera's"
-REPEATED = "repeats the image before while the robot moves"
+NO_IMAGE, OTHER_SIZE = "cannot be read", "have another size than the camera's"
+REPEATED = "repeat the image before while the robot moves"
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,9 @@ class View:
     segments_image: Segments  # capacity M, pixels of the undistorted image
     overflow: int  # segments that found no place
     detected: int  # segments before packing
-    fault: str  # why it tells nothing: no image, of another size, or the last one again; "" if it does
+    fault: (
+        str  # why it tells nothing: no image, of another size, or the last one again; "" if it does
+    )
     seconds: dict[str, float]  # of each stage
 
     @property
@@ -49,35 +51,35 @@ class Frontend:
         camera_file: CameraFile,
         settings: FrontendSettings | None = None,
         detector: Detector | None = None,
-        white: int | None = None,
+        bits: int | None = None,
     ):
         """**Arguments:**
         - `detector`: one's own, in the place of the one that the settings name.
-        - `white`: of images of 16 bits, as of `read_image`.
+        - `bits`: of images of 16 bits, as of `read_image`.
         """
         cv2.setNumThreads(1)
         self.settings = settings or FrontendSettings()
         self.detector = detector or DETECTORS[self.settings.detector]
         self.camera_file = camera_file
-        self.white = white
+        self.bits = bits
         self.lens = Lens(camera_file)
         mount = camera_file.mount
         self._horizon = horizon_image(self.lens.K, float(mount.pitch), float(mount.roll))
 
     @classmethod
     def of(cls, drive: Drive, settings: FrontendSettings | None = None) -> "Frontend":
-        """For the images of a drive, once it is known that there are some and what is white.
+        """For the images of a drive, once it is known that there are some and of how many bits.
 
         **Raises:** `InputError` if none of the images is one of the camera's.
         """
-        return cls(drive.camera_file, settings, white=largest_value(drive))
+        return cls(drive.camera_file, settings, bits=bit_depth(drive))
 
     @property
     def remarks(self) -> list[str]:
         """Sentences on how the images are read."""
-        if self.white in (None, FULL):
+        if self.bits in (None, 8):
             return []
-        return [f"the images have 16 bits; their largest value, {self.white}, is taken as white"]
+        return [f"the images have 16 bits; by their largest value the camera fills {self.bits}"]
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
         """The image [height, width] as a pinhole camera with the same K would have taken it."""
@@ -92,7 +94,7 @@ class Frontend:
     def view(self, path: Path) -> View:
         """One image's file, decoded, undistorted, searched and packed."""
         clock = [time.perf_counter()]
-        image = read_image(path, self.white)
+        image = read_image(path, self.bits)
         clock.append(time.perf_counter())
         fault = self._fault(image)
         if not fault:

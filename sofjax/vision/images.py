@@ -8,23 +8,20 @@ import numpy as np
 from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 
-FULL = 255  # the white of 8 bits
-
-
-def read_image(path: Path, white: int | None = None) -> np.ndarray | None:
+def read_image(path: Path, bits: int | None = None) -> np.ndarray | None:
     """The image in grey, [height, width] uint8; None if there is none that can be read.
 
     The turn that a file's EXIF asks for is not made: the calibration is of the sensor's pixels.
 
     **Arguments:**
-    - `white`: the value of 16 bits that becomes 255, as a camera of 10 or 12 bits fills them only
-      in part; by default the image's largest.
+    - `bits`: how many the camera fills of the 16 of an image, of which the upper 8 are kept; by
+      default as many as the image's largest value takes.
     """
     image = decode(path)
     if image is None or image.dtype == np.uint8:
         return image
-    white = max(int(image.max()) if white is None else white, 1)
-    return np.rint(np.minimum(image, white) * np.float32(FULL / white)).astype(np.uint8)
+    bits = depth(image) if bits is None else bits
+    return np.minimum(image >> (bits - 8), 255).astype(np.uint8)
 
 
 def decode(path: Path) -> np.ndarray | None:
@@ -37,8 +34,8 @@ def decode(path: Path) -> np.ndarray | None:
     return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 
-def largest_value(drive: Drive) -> int:
-    """What is white in the images of a drive: 255, or of 16 bits the largest value of them all.
+def bit_depth(drive: Drive) -> int:
+    """How many bits the images of a drive fill, 8 to 16, by the largest value of them all.
 
     **Raises:** `InputError` if none of the images is one of the camera's.
     """
@@ -54,9 +51,14 @@ def largest_value(drive: Drive) -> int:
     else:
         raise InputError(_none_usable(drive, other))
     if image.dtype == np.uint8:
-        return FULL
+        return 8
     stored = (decode(file) for file in drive.image_files)
-    return max(int(image.max()) for image in stored if image is not None)
+    return max(depth(image) for image in stored if image is not None)
+
+
+def depth(image: np.ndarray) -> int:
+    """How many bits the largest value of an image takes, 8 at least."""
+    return max(8, int(image.max()).bit_length())
 
 
 def _none_usable(drive: Drive, other: tuple[Path, tuple[int, int]] | None) -> str:
