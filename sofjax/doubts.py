@@ -1,36 +1,94 @@
 """Sentences on what a drive and its run betray: worth a look, no reason to refuse."""
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Iterator, Mapping
 
+import jax.numpy as jnp
 import numpy as np
 
+from sofjax.geometry import SE2, Camera, Mount
+from sofjax.geometry.angles import wrap
 from sofjax.io.camera_file import doubts as camera_doubts
-from sofjax.io.drive import Drive, odometry_warnings
-from sofjax.io.trajectory import gaps
+from sofjax.io.drive import Drive, motions, odometry_warnings
+from sofjax.io.trajectory import Trajectory, gaps
 from sofjax.motion import BIAS, MotionModel, prior_bias
+from sofjax.observation import Observation
+from sofjax.slam import SlamConfig
+from sofjax.sof import extract_along
 
 FEW = 1 / 3  # of the segments on the floor's side, below which something is wrong ...
 ENOUGH = 100  # ... if there are so many
+ALIKE = 0.9  # of the share of the best explanation: another that may be it
+MORE = 1.3  # times as many, and as large a share, are explained by what is wrong
 SIGMAS = 5.0  # of its prior, beyond which a learned error of the odometer is no error of one
 HOLE = 1.0  # seconds without an image that are told one by one
 MANY = 5  # holes that are told
 
 
-def set_up(associated: int, on_floor_side: int) -> list[str]:
-    """Whether far fewer segments move as the floor does than where all numbers are right.
+def set_up(config: SlamConfig, drive: Drive, log: Observation) -> list[str]:
+    """Whether far fewer segments move as the floor does than should, and which of the usual
+    mistakes explains it: with it taken back, many more do.
 
     **Arguments:**
-    - `associated`: segments that eq. (9) takes for floor.
-    - `on_floor_side`: segments below the horizon and within range.
+    - `log`: observations of the drive's first images, leading T, as `vision.observations` gives.
     """
-    if on_floor_side < ENOUGH or associated >= FEW * on_floor_side:
+    camera, mount = drive.camera_file.camera, drive.camera_file.mount
+    on_floor, on_side = _moving_as_floor(config, camera, mount, log)
+    if on_side < ENOUGH:
         return []
+    share, better = on_floor / on_side, []
+    for words, odometry, other in _usual_mistakes(drive.odometry, mount):
+        steps = motions(dataclasses.replace(drive, odometry=odometry))[: len(log.overflow)]
+        motion = SE2(jnp.asarray(steps[:, :2], float), jnp.asarray(steps[:, 2], float))
+        other_log = dataclasses.replace(log, motion=motion)
+        then, of = _moving_as_floor(config, camera, other, other_log)
+        if then > MORE * on_floor and then / max(of, 1) > max(MORE * share, FEW):
+            better.append((then / of, words))
+    better = [(more, words) for more, words in better if more > ALIKE * max(better)[0]]
+    if share >= FEW and not better:
+        return []
+    said = (
+        f"only {100 * share:.0f} % of the segments on the floor's side of the horizon move as the "
+        "floor does; where the set-up is right half of them and more do. "
+    )
+    if better:
+        better = sorted(better, reverse=True)
+        then = ", or ".join(f"if {words} ({100 * more:.0f} % then)" for more, words in better)
+        return [f"{said}Far more would {then}"]
     return [
-        f"only {100 * associated / on_floor_side:.0f} % of the segments on the floor's side of the "
-        "horizon move as the floor does; where the set-up is right it is half of them and more. "
-        "Likely causes, the likeliest first: pitch, height or roll of the mount; units or axes of "
-        "the odometry; clocks of images and odometry that differ; the camera's matrix or lens"
+        f"{said}Likely causes, the likeliest first: pitch, height or roll of the mount; the clocks "
+        "of images and odometry; the camera's matrix or lens; the odometry's units or axes"
     ]
+
+
+def _moving_as_floor(
+    config: SlamConfig, camera: Camera, mount: Mount, log: Observation
+) -> tuple[int, int]:
+    """Segments that eq. (9) takes for floor, and those on the floor's side of the horizon."""
+    found = extract_along(config.association, camera, mount, log, config.filter.max_depth)
+    return int(found.is_floor.sum()), int(found.segments_robot.valid.sum())
+
+
+def _usual_mistakes(odometry: Trajectory, mount: Mount) -> Iterator[tuple[str, Trajectory, Mount]]:
+    """Each in words, and the odometry and the mount with it taken back."""
+    stamps, xy, yaw = odometry.stamps, odometry.xy, odometry.yaw
+    for times, words in (
+        (2.0, "the odometry reads half of the way, or the mount's height is twice the true one"),
+        (0.5, "the odometry reads twice the way, or the mount's height is half the true one"),
+        (0.01, "the odometry is in centimetres"),
+        (0.001, "the odometry is in millimetres"),
+    ):
+        yield words, Trajectory(stamps, times * xy, yaw), mount
+    yield "x and y of the odometry are swapped", Trajectory(stamps, xy[:, ::-1], yaw), mount
+    yield "the odometry's x and y have the wrong sign", Trajectory(stamps, -xy, yaw), mount
+    yield "the odometry's heading has the wrong sign", Trajectory(stamps, xy, -yaw), mount
+    for seconds in (-0.2, -0.1, 0.1, 0.2):
+        words = f"the images are stamped {abs(seconds):g} s {'late' if seconds > 0 else 'early'}"
+        yield words, Trajectory(stamps + seconds, xy, yaw), mount
+    for turn in (-np.pi / 2, np.pi / 2, np.pi):
+        roll = float(wrap(mount.roll + turn))
+        turned = dataclasses.replace(mount, roll=jnp.asarray(roll, float))
+        yield f"the mount's roll is {round(roll, 2) + 0.0:.2f}", odometry, turned
 
 
 def of_drive(drive: Drive) -> list[str]:

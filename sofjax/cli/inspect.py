@@ -37,6 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from sofjax import doubts, viewer
     from sofjax.cli import outputs
     from sofjax.io.drive import read_drive
+    from sofjax.presets import PRESETS
     from sofjax.vision import Frontend
 
     drive = read_drive(args.drive)
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     drive = dataclasses.replace(drive, remarks=drive.remarks + frontend.remarks)
     warnings = doubts.of_drive(drive)
     warnings += [f"{len(files)} images {fault}" for fault, files in seen.faults.items()]
-    wrong = drive.contradictions + doubts.set_up(seen.associated, seen.below_horizon)
+    wrong = drive.contradictions + doubts.set_up(PRESETS["default"], drive, seen.log)
     warnings += [doubt for doubt in wrong if doubt not in warnings]
     for warning in warnings:
         print(f"  warning   {warning}")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sofjax import doubts, slam, viewer
@@ -69,6 +70,9 @@ def write_results(
 ) -> Results:
     """Write the map and the figure, and compare with the truth where it is known."""
     found = warnings(drive, tally) + doubts.odometer(tally.odometer, settings.slam.motion)
+    if 2 * tally.step["associated"] < tally.step["below_horizon"]:
+        log = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *tally.observations)
+        found += doubts.set_up(settings.slam, drive, log)
     results = Results(np.zeros((0, 2, 2)), 0, interrupted, found, closed)
     seen, height = np.zeros(0, int), np.zeros(0)
     if state is not None:
@@ -154,7 +158,6 @@ def _ellipses(closed: Closed, to_truth: RigidMotion) -> tuple[np.ndarray, np.nda
 def warnings(drive: Drive, tally: Tally) -> list[str]:
     """Sentences on what was odd about the drive."""
     found = doubts.of_drive(drive)
-    found += doubts.set_up(tally.step["associated"], tally.step["below_horizon"])
     n = len(tally.stamps)
     why = ", ".join(f"{len(files)} {fault}" for fault, files in tally.faults.items())
     for count, text in (

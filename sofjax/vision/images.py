@@ -8,6 +8,7 @@ import numpy as np
 from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 
+
 def read_image(path: Path, bits: int | None = None) -> np.ndarray | None:
     """The image in grey, [height, width] uint8; None if there is none that can be read.
 
