@@ -18,6 +18,7 @@ from sofjax.sof import extract_along
 
 FEW = 1 / 3  # of the segments on the floor's side, below which something is wrong ...
 ENOUGH = 100  # ... if there are so many
+FAR_OFF = 1.4  # times the height that was given, either way
 ALIKE = 0.9  # of the share of the best explanation: another that may be it
 MORE = 1.3  # times as many, and as large a share, are explained by what is wrong
 SIGMAS = 5.0  # of its prior, beyond which a learned error of the odometer is no error of one
@@ -89,6 +90,19 @@ def _usual_mistakes(odometry: Trajectory, mount: Mount) -> Iterator[tuple[str, T
         roll = float(wrap(mount.roll + turn))
         turned = dataclasses.replace(mount, roll=jnp.asarray(roll, float))
         yield f"the mount's roll is {round(roll, 2) + 0.0:.2f}", odometry, turned
+
+
+def fitted_height(fitted: float, start: float) -> list[str]:
+    """Whether a fitted height, metres, is another than a tape and the eye could have given."""
+    ratio = fitted / start
+    if 1 / FAR_OFF < ratio < FAR_OFF:
+        return []
+    # the height is in the odometer's metres
+    reads = "half" if 0.4 < ratio < 0.6 else "double" if 1.7 < ratio < 2.5 else f"{ratio:.2g} times"
+    return [
+        f"the height is {ratio:.2f} of the {start:g} m that the fit began at: does the odometer "
+        f"read {reads} of the way, or was the height not measured?"
+    ]
 
 
 def of_drive(drive: Drive) -> list[str]:

@@ -161,6 +161,7 @@ def calibrate(
     from sofjax.calibration import TURNS, DriveRules, FitRules, fit_drive
     from sofjax.calibration.fit import doubts
     from sofjax.calibration.report import SCALE, estimates
+    from sofjax.doubts import fitted_height
     from sofjax.vision import Frontend
 
     at = drive.odometry.at(drive.image_stamps)
@@ -190,7 +191,10 @@ def calibrate(
     rms = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.nan
     lines = estimates(fitted, odometer, covariance, rules.fit.free)
     pairs = len(residuals)
-    doubt = doubts(found.fit)
+    doubt = "; ".join([
+        *filter(None, [doubts(found.fit)]),
+        *fitted_height(float(fitted.height), float(mount.height)),
+    ])  # fmt: skip
     verdict = _words(fitted, covariance) + f"; {doubt}" * bool(doubt) if usable else why
     word = ("doubtful" if doubt else "good") if usable else "not usable"
     count = f"{pairs} of {found.related} pairs of segments taken for floor"

@@ -176,14 +176,19 @@ def _stale(trajectory: Trajectory) -> np.ndarray:
     still = (way == 0) & (turn == 0)
     edges = np.diff(np.concatenate([[0], still.astype(int), [0]]))
     period = float(np.median(dt))
+    so_far = [np.append(0.0, np.cumsum(step)) for step in (way, turn)]
     for begin, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
         if begin == 0 or end == len(dt):  # nothing before or behind tells
             continue
-        seconds = trajectory.stamps[end + 1] - trajectory.stamps[begin]
+        now, seconds = (
+            trajectory.stamps[begin],
+            trajectory.stamps[end + 1] - trajectory.stamps[begin],
+        )
+        since = max(now - seconds, trajectory.stamps[0])
+        before = [s[begin] - np.interp(since, trajectory.stamps, s) for s in so_far]
         caught_up = any(
-            step[begin - 1] > 0
-            and step[end] > CAUGHT_UP * step[begin - 1] / dt[begin - 1] * seconds
-            for step in (way, turn)
+            step[end] > CAUGHT_UP * driven * seconds / (now - since) > 0
+            for step, driven in zip((way, turn), before, strict=True)
         )
         if seconds - dt[end] > STALE_PERIODS * period and caught_up:
             stale[begin + 1 : end + 1] = True
@@ -225,7 +230,9 @@ def _without(trajectory: Trajectory, jump: np.ndarray) -> Trajectory:
     for i in np.flatnonzero(jump):
         near = known[np.abs(known - i) <= 3]
         usual = np.median(steps[near] / dt[near, None], axis=0) if len(near) else np.zeros(3)
-        steps[i] = usual * dt[i]
+        x, y, turn = usual * dt[i]
+        along = (x + 1j * y) * np.exp(0.5j * turn) * np.sinc(turn / (2 * np.pi))  # the arc's chord
+        steps[i] = along.real, along.imag, turn
     yaw = trajectory.yaw[0] + np.append(0.0, np.cumsum(steps[:, 2]))
     c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
     moved = np.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]], axis=1)
