@@ -66,8 +66,10 @@ def _moving_as_floor(
     config: SlamConfig, camera: Camera, mount: Mount, log: Observation
 ) -> tuple[int, int]:
     """Segments that eq. (9) takes for floor, and those on the floor's side of the horizon."""
-    found = extract_along(config.association, camera, mount, log, config.filter.max_depth)
-    return int(found.is_floor.sum()), int(found.segments_robot.valid.sum())
+    max_depth = config.filter.max_depth
+    found, compared = extract_along(config.association, camera, mount, log, max_depth)
+    on_side = found.segments_robot.valid & compared[:, None]
+    return int(found.is_floor.sum()), int(on_side.sum())
 
 
 def _usual_mistakes(odometry: Trajectory, mount: Mount) -> Iterator[tuple[str, Trajectory, Mount]]:

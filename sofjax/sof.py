@@ -104,13 +104,14 @@ def extract_along(
     mount: Mount,
     log: Observation,
     max_depth: Float[Array, ""] | float = 20.0,
-) -> SofExtraction:
+) -> tuple[SofExtraction, Bool[Array, "T"]]:
     """SoF of a whole log by the odometer's motion alone, each image against one a baseline before.
 
     **Arguments:**
     - `log`: observations with a leading axis T.
 
-    **Returns:** the extractions with a leading axis T.
+    **Returns:** the extractions with a leading axis T, and which images had one to be compared
+    with.
     """
 
     def next_image(carry, observation):
@@ -123,7 +124,7 @@ def extract_along(
             view.T_world_robot.between(T_world_robot), max_depth,
         )  # fmt: skip
         kept = keep_views(config, recent, reference, View(second, T_world_robot))
-        return (T_world_robot, *kept), found
+        return (T_world_robot, *kept), (found, view.segments_image.valid.any())
 
     start = jax.tree.map(lambda a: jnp.zeros_like(a[0]), (log.motion, log.segments_image))
     none = View(start[1], start[0])

@@ -1,6 +1,7 @@
 """What cannot be used is refused with one sentence and exit code 2, never a traceback."""
 
 import shutil
+import time
 from pathlib import Path
 
 import cv2
@@ -95,7 +96,7 @@ ROWS = {
     "infinite": ("0.040 0 1e999 0 0 0 0 1", "line 3: '1e999' is not a finite number"),
     "a word": ("0.040 0 east 0 0 0 0 1", "line 3: 'east' is not a number"),
     "commas": ("0.040,0,0,0,0,0,0,1", "line 3: 1 columns"),
-    "a stamp again": ("0.000 0 0 0 0 0 0 1", "line 3: the timestamp 0.000000 repeats"),
+    "a stamp again": ("0.000 7 0 0 0 0 0 1", "lines 2, 3: a timestamp repeats with another value"),
     "a stamp back": ("-1.0 0 0 0 0 0 0 1", "line 3: the timestamp -1.000000 runs back"),
     "no quaternion": ("0.040 0 0 0 0 0 0 0", "line 3: the quaternion qx qy qz qw has length 0"),
     "a camera's axes": ("0.040 0 0 0 0.5 -0.5 0.5 -0.5", "x forward and z up"),
@@ -128,7 +129,7 @@ IMAGE_ROWS = {
     "one column": ("rgb/000001.jpg", "two columns"),
     "nan": ("nan rgb/000001.jpg", "'nan' is not a finite number"),
     "a word": ("soon rgb/000001.jpg", "'soon' is not a number"),
-    "a stamp again": ("0.000 rgb/000001.jpg", "repeats"),
+    "a stamp again": ("0.000 rgb/000001.jpg", "lines 2, 3: a timestamp repeats"),
     "a stamp back": ("-5 rgb/000001.jpg", "runs back"),
     "a folder above": ("0.100 ../secret.jpg", "inside the drive's folder"),
     "a way round": ("0.100 rgb/../../secret.jpg", "inside the drive's folder"),
@@ -145,7 +146,28 @@ def test_a_row_that_is_no_image(refused, drive, fault):
     lines[2] = row
     (drive / "rgb.txt").write_text("\n".join(lines))
     err = refused("run", drive)
-    assert "rgb.txt, line 3: " in err and sentence in err
+    assert "rgb.txt, line" in err and sentence in err
+
+
+def test_a_list_of_a_million_images_that_are_not_there(refused, drive):
+    rows = "".join(f"{i} rgb/{i}.jpg\n" for i in range(300_000))
+    (drive / "rgb.txt").write_text(rows)
+    begun = time.process_time()
+    assert "300000 of its 300000 images are missing" in refused("inspect", drive)
+    assert time.process_time() - begun < 4
+
+
+def test_an_image_below_a_million_folders(refused, drive):
+    replace(drive / "rgb.txt", "rgb/000001.jpg", "a/" * 1_000_000 + "b.jpg")
+    assert "rgb.txt, line 3: the image 'a/a/" in refused("run", drive)
+
+
+def test_stamps_of_different_units(refused, drive):
+    rows = [line.split() for line in (drive / "odometry.txt").read_text().splitlines()[1:]]
+    counted = [" ".join([str(round(float(t) * 1e9)), *pose]) for t, *pose in rows]
+    (drive / "odometry.txt").write_text("\n".join(counted))
+    err = refused("run", drive)
+    assert "odometry.txt: its timestamps are nanoseconds and those of rgb.txt and " in err
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "ring"])

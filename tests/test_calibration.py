@@ -1,5 +1,7 @@
 """The mount from pairs of segments: recovered, honest about its errors, and refused where blind."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,7 @@ from sofjax.calibration.heights import FloorRules, on_floor
 from sofjax.calibration.pairs import Estimate, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
 from sofjax.geometry import SE2, Mount, Segments, projection_matrix
+from sofjax.motion import MotionModel, without_unread_motions
 from sofjax.observation import Observation
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -367,6 +370,23 @@ def test_lines_are_followed_though_missed_once_and_the_mount_is_rough(camera, mo
                 assert of_line[t, m] == of_line[t - 1, before]
     gap = [track[t, np.flatnonzero(order[t] == 5)[0]] for t in (19, 21)]
     assert gap[0] == gap[1] >= 0
+
+
+def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
+    log, _ = log
+    rules = TrackRules()
+    unread = dataclasses.replace(log, motion_sigma=jnp.zeros((40, 3)).at[20].set(0.1))
+    track = follow(rules, camera, start_at(mount), unread)
+    before, behind = (np.unique(part[part >= 0]) for part in (track[:20], track[20:]))
+    assert len(before) == 12 and not np.intersect1d(before, behind).size
+    known = without_unread_motions(MotionModel(), log)
+    assert known is log
+    xy = log.motion.xy.at[20, 0].set(jnp.nan)
+    nan = dataclasses.replace(log, motion=SE2(xy, log.motion.yaw))
+    known = without_unread_motions(MotionModel(), nan)
+    assert (np.flatnonzero(np.asarray(known.motion_sigma).any(axis=1)) == [20]).all()
+    assert np.isfinite(known.motion.xy).all()
+    np.testing.assert_array_equal(known.motion.xy[:20], log.motion.xy[:20])
 
 
 def test_pairs_are_nested_and_use_each_segment_once(camera, mount, log):

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from sofjax.cli.errors_table import errors_table
 from sofjax.evaluation import (
+    MapErrors,
     RigidMotion,
     align,
     distance_to_segments,
@@ -32,6 +34,33 @@ def curved(seed=0, n=300):
     yaw = np.cumsum(rng.normal(0, 0.05, n))
     xy = np.cumsum(0.05 * np.stack([np.cos(yaw), np.sin(yaw)], 1), axis=0)
     return Trajectory(0.1 * np.arange(n), xy, yaw)
+
+
+def test_true_poses_in_a_gap_of_the_estimate_are_left_out():
+    """What is interpolated over a gap is nobody's estimate, and no error of it."""
+    truth = curved()
+    keep = (truth.stamps < 10) | (truth.stamps > 14)
+    estimate = Trajectory(truth.stamps[keep], truth.xy[keep], truth.yaw[keep])
+    errors, _ = evaluate_trajectory(truth, estimate)
+    assert errors.max_m == pytest.approx(0, abs=1e-9)
+    assert errors.yaw_deg == pytest.approx(0, abs=1e-6)
+    assert errors.coverage == pytest.approx(keep.mean(), abs=0.01)
+    keep = np.arange(300) % 10 != 5  # an estimate missed now and then is interpolated
+    estimate = Trajectory(truth.stamps[keep], truth.xy[keep], truth.yaw[keep])
+    assert evaluate_trajectory(truth, estimate)[0].coverage == 1
+
+
+def test_the_table_of_errors_stays_a_table():
+    truth = straight()
+    far = Trajectory(truth.stamps, truth.xy * 1e6, truth.yaw)
+    still = Trajectory(truth.stamps, 0 * truth.xy, truth.yaw)
+    few, _ = evaluate_trajectory(still, still)
+    large, _ = evaluate_trajectory(truth, far)
+    nothing = MapErrors(0, 0.0, 0.0, 0.0, float("nan"))
+    lines = errors_table(large, few, large, nothing)
+    assert "nan" not in "".join(lines) and len({len(line) for line in lines[:-3]}) == 1
+    assert all(len(line.split("  ")[-1].split()) <= 2 for line in lines)
+    assert lines[-1].endswith(" -")
 
 
 def test_alignment_finds_a_rigid_motion_and_no_scale():

@@ -15,7 +15,13 @@ from sofjax.io.errors import InputError
 from sofjax.io.map_file import read_map, write_map
 from sofjax.io.settings import INLINE, read_toml, to_dict, to_toml, with_settings
 from sofjax.io.text import write_atomically
-from sofjax.io.trajectory import Trajectory, TrajectoryWriter, read_trajectory
+from sofjax.io.trajectory import (
+    Trajectory,
+    TrajectoryWriter,
+    gaps,
+    read_trajectory,
+    read_trajectory_file,
+)
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 
@@ -45,6 +51,43 @@ def test_comments_blank_lines_and_a_byte_order_mark_are_passed_over(tmp_path):
     text = "\ufeff# a comment\n\n0 1 2 0 0 0 0 1\r\n  # another\n1 2 2 0 0 0 0 1"
     (tmp_path / "t.txt").write_text(text, encoding="utf-8")
     np.testing.assert_array_equal(read_trajectory(tmp_path / "t.txt").xy, [[1, 2], [2, 2]])
+
+
+def test_rows_that_stand_there_twice_are_dropped_and_counted(tmp_path):
+    row = "{} {} 0 0 0 0 0 1\n"
+    once = [row.format(t, 0.1 * t) for t in range(6)]
+    (tmp_path / "t.txt").write_text("".join(once[:3] + once[2:3] + once[3:] + once[1:2]))
+    read = read_trajectory_file(tmp_path / "t.txt", "a trajectory")
+    np.testing.assert_array_equal(read.trajectory.stamps, range(6))
+    np.testing.assert_array_equal(read.lines, [1, 2, 3, 5, 6, 7])
+    assert read.remarks == ["t.txt: 2 rows repeat another and were dropped, line 4 first"]
+
+
+def test_different_poses_at_one_stamp_are_refused_with_all_their_lines(tmp_path):
+    poses = [(0, 0), (1, 1), (1, 2), (2, 2), (2, 2), (3, 3), (3, 4)]
+    rows = [f"{t} {x} 0 0 0 0 0 1" for t, x in poses]
+    (tmp_path / "t.txt").write_text("\n".join(rows))
+    with pytest.raises(InputError, match=r"t\.txt, lines 2, 3, 6, 7: a timestamp repeats"):
+        read_trajectory(tmp_path / "t.txt")
+
+
+@pytest.mark.parametrize("epoch", [0, 1_700_000_000_000_000_000])
+def test_stamps_in_nanoseconds_are_read_as_seconds(tmp_path, epoch):
+    rows = [f"{epoch + i * 40_000_000} {i} 0 0 0 0 0 1" for i in range(5)]
+    (tmp_path / "t.txt").write_text("\n".join(rows))
+    read = read_trajectory_file(tmp_path / "t.txt", "a trajectory")
+    assert read.nanoseconds and "nanoseconds" in read.remarks[0]
+    np.testing.assert_allclose(
+        read.trajectory.stamps - 1e-9 * epoch, 0.04 * np.arange(5), atol=1e-6
+    )
+    seconds = [f"{1_700_000_000 + 0.04 * i:.3f} {i} 0 0 0 0 0 1" for i in range(5)]
+    (tmp_path / "t.txt").write_text("\n".join(seconds))
+    assert not read_trajectory_file(tmp_path / "t.txt", "a trajectory").nanoseconds
+
+
+def test_times_far_longer_than_usual_are_gaps():
+    assert gaps(np.array([0.0, 1.0, 2.0, 3.0, 6.0, 7.0])) == [(3.0, 3.0)]
+    assert gaps(np.arange(5.0)) == gaps(np.zeros(1)) == []
 
 
 def test_a_camera_file_is_read_back_number_for_number(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import operator
 
 import equinox as eqx
@@ -495,3 +496,40 @@ def test_runs_side_by_side_are_the_runs_one_by_one():
             one = jax.tree.map(operator.itemgetter(i), together)
             for a, b in zip(numbers(one), numbers(alone(*each)), strict=True):
                 np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)
+
+
+def test_a_motion_that_is_not_a_number_is_an_unknown_one():
+    """The path goes on, and the map finds the robot again."""
+    unread = [frame(i) for i in range(T)]
+    for i in (12, 25):
+        nan = SE2(unread[i].motion.xy * jnp.nan, unread[i].motion.yaw)
+        unread[i] = dataclasses.replace(unread[i], motion=nan)
+    _, infos = stepped(unread)
+    for leaf in jax.tree.leaves(infos):
+        assert not np.isnan(leaf).any()
+    _, usual = default_run()
+    assert (
+        trajectory_error(infos.T_world_robot.xy) < trajectory_error(usual.T_world_robot.xy) + 0.05
+    )
+
+
+def test_what_the_odometer_does_not_tell_spreads_the_particles():
+    state = start()
+    sigma = jnp.array([0.3, 0.1, 0.2])
+    still = dataclasses.replace(black(SE2.identity()), motion_sigma=sigma)
+    known = dataclasses.replace(still, motion_sigma=jnp.zeros(3))
+    step = jit_quickly(slam.step.__wrapped__)
+    spread, _ = step(CONFIG, CAMERA, MOUNT, state, still)
+    twist = np.asarray(spread.particles.T_world_robot.log())
+    np.testing.assert_allclose(twist.std(axis=0), sigma, rtol=0.35)
+    assert (np.asarray(spread.particles.bias.mean) == 0).all()  # it is no error of the odometer
+    same, _ = step(CONFIG, CAMERA, MOUNT, state, known)
+    assert (np.asarray(same.particles.T_world_robot.xy) == 0).all()
+
+
+def test_the_counts_of_a_step_narrow_down():
+    _, infos = default_run()
+    counts = [infos.detected, infos.below_horizon, infos.associated, infos.reobserved]
+    assert all((a >= b).all() for a, b in itertools.pairwise(map(np.asarray, counts)))
+    assert int(infos.reobserved.sum()) > 100
+    assert (np.asarray(infos.reobserved) <= np.asarray(infos.matched)).all()

@@ -1,5 +1,10 @@
 """The front end: where an edge is, what a lens does to it, and what is kept of it."""
 
+import struct
+import subprocess
+import sys
+import zlib
+
 import cv2
 import jax.numpy as jnp
 import numpy as np
@@ -13,10 +18,12 @@ from sofjax.vision import (
     Frontend,
     FrontendSettings,
     Lens,
+    View,
     detect_hough,
     detect_lsd,
     pack,
     read_image,
+    without_repeats,
 )
 
 MIDDLE = 99.5  # of a 200 px image, whole numbers being the middles of pixels
@@ -192,3 +199,52 @@ def test_the_horizon_in_numpy_is_that_of_the_geometry(pitch, roll):
     plain = horizon_image(np.asarray(camera.K), pitch, roll)
     plain, line = (l / np.linalg.norm(l) for l in (plain, line))
     np.testing.assert_allclose(plain, line, atol=1e-5)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_an_image_of_16_bits_is_read_as_its_upper_eight_of_those_that_are_filled(tmp_path, bits):
+    image = np.random.default_rng(0).integers(0, 256, (240, 320)).astype(np.uint8)
+    image[0, 0] = 255
+    stored = (image.astype(np.uint16) << (bits - 8)) + (1 << (bits - 8)) - 1
+    cv2.imwrite(str(tmp_path / "a.png"), stored)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), image)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png", 16), image >> (16 - bits))
+
+
+def test_a_small_file_that_unfolds_into_gigabytes_is_no_image(tmp_path):
+    """In a process of its own: OpenCV takes the limit when it is loaded."""
+    rows = b"".join(b"\0" * 20001 for _ in range(20000))
+    chunk = lambda kind, data: (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    )
+    header = struct.pack(">IIBBBBB", 20000, 20000, 8, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows))
+    (tmp_path / "bomb.png").write_bytes(png + chunk(b"IEND", b""))
+    code = (
+        "import resource, sys\n"
+        "from sofjax.vision import read_image\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "assert read_image(sys.argv[1]) is None\n"
+        "assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + 100_000\n"
+    )
+    subprocess.run([sys.executable, "-c", code, tmp_path / "bomb.png"], check=True)
+
+
+def view_of(*segments, fault=""):
+    packed, overflow = pack(np.reshape(segments, (-1, 4)).astype(np.float32), 4)
+    return View(packed, overflow, len(segments), fault, {})
+
+
+def test_a_view_that_repeats_the_last_one_while_the_robot_moves_tells_nothing():
+    a, b, empty = view_of([0, 0, 9, 9]), view_of([0, 0, 9, 8]), view_of()
+    lost = view_of(fault="cannot be read")
+    moved, still = [0.05, 0, 0], [0.0, 0, 0]
+    views = [a, a, a, lost, a, b, b, empty, empty, b]
+    steps = [moved, still, moved, moved, moved, moved, still, moved, moved, moved]
+    judged = list(without_repeats(views, np.array(steps)))
+    repeats = [i for i, view in enumerate(judged) if view.fault.startswith("repeat")]
+    assert repeats == [2, 4, 9]
+    assert all(not judged[i].segments_image.valid.any() for i in repeats)
+    assert judged[3].fault == "cannot be read" and judged[7].readable
+    turning = list(without_repeats([a, a], np.array([still, [0, 0, 0.05]])))
+    assert not turning[1].readable

@@ -110,7 +110,9 @@ def look(drive: "Drive", frontend: "Frontend") -> Seen:
         log.append(observed)
     log = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *log)
     config, file = PRESETS["default"], drive.camera_file
-    found = extract_along(config.association, file.camera, file.mount, log, config.filter.max_depth)
+    found, _ = extract_along(
+        config.association, file.camera, file.mount, log, config.filter.max_depth
+    )
     on_floor_side, is_floor = map(np.asarray, (found.segments_robot.valid, found.is_floor))
     return Seen(log, faults, usable, segments, on_floor_side, is_floor)
 
