@@ -275,8 +275,8 @@ def step(
         believed = OdometerBias(mean_bias, bias.covariance)
         window, segment_map, T_new_old = slide(
             config.window, rules, sensor, config.motion, window, segment_map,
-            mount.T_robot_foot, odometer, unknown, chosen, best.tilt, believed, sightings,
-            new_at, config.filter.max_depth,
+            mount.T_robot_foot, odometer, chosen, best.tilt, believed, sightings,
+            new_at, config.filter.max_depth, unknown,
         )  # fmt: skip
         chosen = T_new_old @ chosen
         particles = eqx.tree_at(

@@ -93,17 +93,18 @@ def empty_window(rules: WindowRules, capacity: int, sightings: Sightings) -> Win
 def slide(
     rules: WindowRules, map_rules: MapRules, sensor: SensorModel, model: MotionModel,
     window: Window, segment_map: SegmentMap, T_robot_foot: SE2, odometer: SE2,
-    unknown: Float[Array, "3"], T_world_robot: SE2, tilt: Float[Array, "2"], bias: OdometerBias,
-    sightings: Sightings, new: Int[Array, "M"], reach: Float[Array, ""] | float,
+    T_world_robot: SE2, tilt: Float[Array, "2"], bias: OdometerBias, sightings: Sightings,
+    new: Int[Array, "M"], reach: Float[Array, ""] | float,
+    unknown: Float[Array, "3"] | None = None,
 ) -> tuple[Window, SegmentMap, SE2]:  # fmt: skip
     """Take an image into account; if it is a keyframe, solve for the window that it ends.
 
     **Arguments:**
     - `odometer`: the motion since the last image, as read.
-    - `unknown`: standard deviation of what was not read of it.
     - `T_world_robot`, `tilt`, `bias`: what the filter makes of the image.
     - `new`: slots of the lines that began with the sightings, K for none.
     - `reach`: metres to the farthest line that may be seen.
+    - `unknown`: standard deviation of what was not read of the motion, if there is such.
 
     **Returns:** the window, the map, and T_new_old, by which all that moves with the robot is to
     be moved: the identity if the image is no keyframe, or the solution is not finite.
@@ -113,7 +114,7 @@ def slide(
     begun = segment_map.line.at[new].get(mode="clip")
     known = Known(put(window.known.line, begun), put(window.known.information, loosely))
     motion, way = window.motion @ odometer, window.way + way_of(odometer)
-    variance = window.unknown + unknown**2
+    variance = window.unknown + (0 if unknown is None else unknown**2)
     window = Window(window.keyframes, window.count, known, motion, way, variance)
 
     usable = sightings.valid & ~sightings.upright

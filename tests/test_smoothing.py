@@ -15,6 +15,7 @@ from sofjax.smoothing.blocks import Jacobian
 from sofjax.smoothing.dissection import dissect, divide
 from sofjax.smoothing.elimination import eliminate
 from sofjax.smoothing.marginals import marginals
+from sofjax.smoothing.problem import odometer_residual
 
 pytestmark = pytest.mark.slow  # compiles in double precision, minutes on a busy machine
 
@@ -112,6 +113,17 @@ def test_the_derivatives_of_all_residuals_are_central_differences(problem):
         scale = 1e-3 + jnp.abs(expected).max(axis=1, keepdims=True)  # of each residual
         np.testing.assert_allclose(found / scale, expected / scale, atol=1e-6)
         assert (jnp.abs(found) > 0).any(axis=0).all()  # each unknown is told by some
+
+
+def test_what_the_odometer_did_not_tell_weighs_less(problem):
+    problem, _ = problem
+    with jax.enable_x64(True):
+        before, after = jnp.zeros(5), jnp.zeros(5).at[0].set(0.5)
+        miss = lambda unknown: odometer_residual(
+            problem, before, after, jnp.zeros(8), SE2.identity(), jnp.zeros(3), unknown
+        )[0]
+        assert miss(None) == pytest.approx(500) and miss(jnp.zeros(3)) == pytest.approx(500)
+        assert miss(jnp.full(3, 0.25)) == pytest.approx(1, abs=1e-5)
 
 
 def test_assembled_blocks_are_those_of_the_dense_normal_equations(problem):

@@ -1,7 +1,6 @@
 """Keyframes, associations and merging by worked examples; the rounds on a small drive."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -31,7 +30,6 @@ from sofjax.smoothing.elimination import Factors
 from sofjax.smoothing.lines import associate, lines_of
 from sofjax.smoothing.marginals import Marginals
 from sofjax.smoothing.merging import doubles, representatives
-from sofjax.smoothing.problem import odometer_residual
 from sofjax.smoothing.solution import solve
 from sofjax.smoothing.ties import apart
 
@@ -78,12 +76,6 @@ def test_what_the_odometer_did_not_tell_adds_up_between_keyframes(x64):
     sigma = jnp.zeros((9, 3)).at[2].set(0.3).at[4].set(0.4).at[3].set(0.1)
     frames = kf.gather(replace(log, motion_sigma=sigma), index)
     np.testing.assert_allclose(frames.unknown[1:3, 0], [0.3**2 + 0.1**2, 0.4**2], atol=1e-12)
-    problem = SimpleNamespace(motion_model=MotionModel())
-    still, way = SE2.identity(), jnp.zeros(3)
-    miss = lambda unknown: odometer_residual(
-        problem, jnp.zeros(5), jnp.array([0.5, 0, 0, 0, 0]), jnp.zeros(8), still, way, unknown
-    )[0]
-    assert miss(None) > 400 and miss(jnp.full(3, 0.25)) == pytest.approx(1, abs=1e-3)
 
 
 def test_carried_poses_go_through_their_keyframes_and_keep_the_motion_between(x64, rng):

@@ -20,6 +20,7 @@ from sofjax.io.trajectory import (
 )
 
 MANY = 8  # warnings of one kind
+MAX_IMAGES = 300_000  # more than eight hours at 10 Hz
 MAX_NAME = 1000  # characters of an image's path
 CLOSE = 0.2  # seconds that the odometry may start late or end early without a word
 
@@ -199,10 +200,12 @@ def _read_odometry(path: Path) -> TrajectoryFile:
 
 def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
     """Stamps in seconds, files, whether the stamps are nanoseconds in the list, and remarks."""
-    table = path / "rgb.txt"
+    table, at_line = path / "rgb.txt", f"{path / 'rgb.txt'}, line "
     numbers, stamps, names = [], [], []
     for number, line in rows(table, "the list of images"):
-        where = f"{table}, line {number}"
+        where = f"{at_line}{number}"
+        if len(names) == MAX_IMAGES:
+            raise InputError(f"{where}: more than {MAX_IMAGES} images; give the drive in parts")
         words = line.split(maxsplit=1)
         if len(words) != 2:
             raise InputError(f"{where}: there must be two columns, 'timestamp file'")
@@ -213,7 +216,7 @@ def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
         raise InputError(f"{table}: no image in it; there must be a row 'timestamp file' for each")
     kept, remarks = in_order(table, numbers, stamps, names)
     folder = _Folder(path)
-    there = [folder.has(f"{table}, line {numbers[i]}", names[i]) for i in kept]
+    there = [folder.has(f"{at_line}{numbers[i]}", names[i]) for i in kept]
     if 2 * sum(there) < len(there):
         raise InputError(
             f"{table}: {len(there) - sum(there)} of its {len(there)} images are missing, "
@@ -237,8 +240,8 @@ class _Folder:
 
     def has(self, where: str, name: str) -> bool:
         """Whether an image is there; refused if its name leaves the drive's folder in any way."""
-        parts = name.split("/") if len(name) <= MAX_NAME else [".."]
-        if "\0" in name or ".." in parts or name.startswith("/"):
+        odd = len(name) > MAX_NAME or "\0" in name or name.startswith("/")
+        if odd or (".." in name and ".." in name.split("/")):
             right = "must be a path inside the drive's folder"
             raise InputError(f"{where}: the image {name!r:.120} {right}")
         parent, _, base = name.rpartition("/")
