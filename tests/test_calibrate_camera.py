@@ -228,6 +228,22 @@ def test_boards_that_are_no_chessboard(rays, name):
     assert len(counts) > 1 if dictionary else counts == {len(board.points)}  # parts of a ChArUco
 
 
+def test_the_command_with_a_charuco_board(rays, tmp_path, capfd):
+    board, shades, _ = OTHER_BOARDS["charuco"]
+    rng = np.random.default_rng(8)
+    images = [render(rays, board, *pose, rng, shades) for pose in poses(rng, 9, 0.6, (0.4, 0.6))]
+    folder, out = write(tmp_path / "views", images), tmp_path / "camera.yaml"
+    args = ["--board", "7x5", "--square", "0.05", "--pattern", "charuco", "--marker", "0.037"]
+    args += ["--mount", "height=0.6,pitch=1.5708", "-o", str(out)]
+    assert main(["calibrate", "camera", str(folder), *args]) == 0
+    assert "board 7x5 of 50 mm, markers of 4X4_50" in capfd.readouterr().out
+    np.testing.assert_allclose(np.diag(read_camera(out).camera.K)[:2], [270, 268], rtol=0.01)
+    assert out.with_suffix(".png").exists()
+    args[1] = "6x4"  # inner corners were counted
+    assert main(["calibrate", "camera", str(folder), *args]) == 2
+    assert "with --board 7x5 they are found" in capfd.readouterr().err
+
+
 def test_the_refined_corners_are_those_of_the_board(rays):
     rng = np.random.default_rng(0)
     rotation, middle = np.array([0.3, -0.4, 0.1]), np.array([0.02, 0.01, 0.5])

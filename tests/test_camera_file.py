@@ -232,6 +232,7 @@ WRONG = {
     "two messages": (TOPIC + "---\n" + TOPIC, "2 documents parted by '---'"),
     "two cameras": (KALIBR + KALIBR.replace("cam0", "cam1"), "holds cam0 and cam1; keep the one"),
     "an omni camera": (KALIBR.replace("pinhole", "omni"), "'camera_model' is 'omni'; it must be"),
+    "not calibrated": (ROS.replace(str(FLAT), str([0.0] * 9)), "'camera_matrix' is all zeros"),
     "3 intrinsics": (KALIBR.replace("500.0, ", ""), "'intrinsics' has 3 numbers and must have 4"),
     "one resolution": (KALIBR.replace("[640, 480]", "640"), "'resolution' is 640; it must be ["),
     "half a resolution": (KALIBR.replace("640", "640.5"), "'resolution' is 640.5; it must be"),
@@ -385,3 +386,14 @@ def test_a_drive_at_the_limit_is_simulated_and_read(tmp_path, tilt, capfd):
     assert main(["simulate", *args, *tilt]) == 0
     assert main(["inspect", drive, "--out", str(tmp_path / "a.png")]) == 0
     assert "warning" not in capfd.readouterr().out
+
+
+def test_a_remark_reaches_the_user(tmp_path, capfd):
+    drive = tmp_path / "drive"
+    args = ["--world", "l", "--images", "2", "--size", "64x48", "--out", str(drive)]
+    assert main(["simulate", *args]) == 0
+    text = (drive / "camera.yaml").read_text()
+    (drive / "camera.yaml").write_text(text.replace("distortion_model: plumb_bob\n", ""))
+    assert main(["inspect", str(drive), "--out", str(tmp_path / "a.png")]) == 0
+    said = capfd.readouterr().out
+    assert "warning   the camera file has no 'distortion_model': plumb_bob is supposed" in said

@@ -88,7 +88,7 @@ def _hint(files: list[Path], board: "Board") -> str:
         if min(sides) < MIN_CORNERS:
             continue
         other = dataclasses.replace(board, columns=sides[0], rows=sides[1])
-        other = recognise(other, images)
+        other = recognise(other, images[:1])
         if all(find_points(image, other) is not None for image in images):
             return f"with --board {other} they are found"
     return {

@@ -90,6 +90,8 @@ def matrix(path: Path, fields: Mapping, width: int, height: int) -> np.ndarray:
         given[key] = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     K = _agreed(path, given, MATRIX[0], fields)
     key = next(iter(given))
+    if not K.any():
+        raise InputError(f"{path}: '{key}' is all zeros, as of a camera that is not calibrated yet")
     shape = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 1]])
     if (K[shape == 0] != 0).any() or K[2, 2] != 1:
         right = "[fx, 0, cx, 0, fy, cy, 0, 0, 1]"
