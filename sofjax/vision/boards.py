@@ -77,7 +77,7 @@ def recognise(board: Board, images: Iterable[np.ndarray]) -> Board:
     if board.pattern != "charuco":
         return board
     count = board.columns * board.rows // 2
-    enough = [[name for name in names if _set_size(name) >= count] for names in SETS]
+    enough = [[name for name in names if len(_markers(name).bytesList) >= count] for names in SETS]
     for image in images:
         seen = [
             (len(found.points), name, legacy)
@@ -144,16 +144,16 @@ def _charuco(
 
 @functools.lru_cache
 def _charuco_detector(board: Board, dictionary: str, legacy: bool) -> cv2.aruco.CharucoDetector:
-    drawn = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square, board.marker, _dictionary(dictionary)
+    whole, count = _markers(dictionary), board.columns * board.rows // 2
+    # its first markers are those of the board, and many are slow to tell apart
+    markers = cv2.aruco.Dictionary(
+        whole.bytesList[:count], whole.markerSize, whole.maxCorrectionBits
     )
+    size = (board.columns, board.rows)
+    drawn = cv2.aruco.CharucoBoard(size, board.square, board.marker, markers)
     drawn.setLegacyPattern(legacy)
     return cv2.aruco.CharucoDetector(drawn)
 
 
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
+def _markers(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
-
-
-def _set_size(name: str) -> int:
-    return len(_dictionary(name).bytesList)
