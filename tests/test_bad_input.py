@@ -252,6 +252,7 @@ CAMERA = {
     "a height nan": ("height: 0.6", "height: .nan", "must be finite"),
     "a height that is true": ("height: 0.6", "height: true", "must be a number"),
     "a pitch in degrees": ("0.2618", "15", "radians"),
+    "a roll in degrees": ("roll: 0.0", "roll: 90", "a full turn, 6.2832, either way"),
     "a pitch to the ceiling": ("0.2618", "-0.8", "above the horizon"),
     "a name twice": ("image_height", "image_width", "twice"),
     "YAML that runs code": ("office", "!!python/object/apply:os.system ['false']", "not plain"),

@@ -1,15 +1,16 @@
-"""Intrinsics from rendered views of a checkerboard, whose camera is known."""
+"""Intrinsics from rendered views of boards, whose camera is known."""
 
 import cv2
 import numpy as np
 import pytest
 
 from sofjax import viewer
-from sofjax.cli import main
+from sofjax.cli import calibrate_camera, main
 from sofjax.io.camera_file import known_mount, mount_fields, read_camera
 from sofjax.io.drive import read_drive
 from sofjax.io.errors import InputError
-from sofjax.vision.checkerboard import Board, find_corners, fit_camera, judge
+from sofjax.vision.boards import PATTERNS, Board, Correspondences, find_points, recognise
+from sofjax.vision.checkerboard import fit_camera, judge, turning_radius
 
 WIDTH, HEIGHT = 320, 240
 K = np.array([[270.0, 0, 161.5], [0, 268.0, 117.5], [0, 0, 1]])
@@ -31,21 +32,56 @@ def rays():
     return flat.reshape(HEIGHT, WIDTH, FINE**2, 2)
 
 
-def render(rays, board, rotation, middle, rng):
-    """A board with a white rim of half a square on a grey wall, its middle at `middle` metres."""
+def render(rays, board, rotation, middle, rng, shades=None):
+    """A board on a grey wall, its middle at `middle` metres; `shades` of it are by its squares."""
     R = cv2.Rodrigues(np.asarray(rotation, float))[0]
     centre = board.points.mean(0)
     t = np.asarray(middle) - R @ centre
     to_board = np.linalg.inv(np.stack([R[:, 0], R[:, 1], t], axis=1))
     X, Y, W = np.moveaxis(rays @ to_board[:, :2].T + to_board[:, 2], -1, 0)
     u, v = X / W / board.square, Y / W / board.square
+    shade = (shades or chessboard)(board, u, v).mean(-1)
+    noisy = cv2.GaussianBlur(shade, (0, 0), 0.5) + rng.normal(0, 1.5, shade.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def chessboard(board, u, v):
+    """Squares with a white rim of half a square."""
     columns, rows = board.columns, board.rows
     dark = (np.floor(u) + np.floor(v)) % 2 == 0
     square = (u > -1) & (u < columns) & (v > -1) & (v < rows)
     rim = (u > -1.5) & (u < columns + 0.5) & (v > -1.5) & (v < rows + 0.5)
-    shade = np.where(square & dark, 30.0, np.where(rim, 220.0, 100.0)).mean(-1)
-    noisy = cv2.GaussianBlur(shade, (0, 0), 0.5) + rng.normal(0, 1.5, shade.shape)
-    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return np.where(square & dark, 30.0, np.where(rim, 220.0, 100.0))
+
+
+def circles(board, u, v):
+    """Circles of a quarter of a square's side, or of half of it where rows are set aside."""
+    x, y = (board.points[:, :2] / board.square).T
+    aside = board.pattern == "acircles"
+    i = np.clip(np.rint(v), 0, board.rows - 1)
+    step, first = (2, i % 2) if aside else (1, 0)
+    j = np.clip(np.rint((u - first) / step), 0, board.columns - 1)
+    dark = np.hypot(u - first - step * j, v - i) < (0.5 if aside else 0.3)
+    rim = (u > -1) & (u < x.max() + 1) & (v > -1) & (v < y.max() + 1)
+    return np.where(rim & dark, 30.0, np.where(rim, 220.0, 100.0))
+
+
+def charuco(dictionary, legacy):
+    """A board as OpenCV draws it, with a white rim of half a square."""
+
+    def shades(board, u, v):
+        size = (board.columns, board.rows)
+        which = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary}"))
+        drawn = cv2.aruco.CharucoBoard(size, board.square, board.marker, which)
+        drawn.setLegacyPattern(legacy)
+        texture = np.float32(drawn.generateImage((60 * size[0], 60 * size[1])))
+        j, i = np.floor(60 * u).astype(int), np.floor(60 * v).astype(int)
+        inside = (j >= 0) & (j < texture.shape[1]) & (i >= 0) & (i < texture.shape[0])
+        rim = (u > -0.5) & (u < size[0] + 0.5) & (v > -0.5) & (v < size[1] + 0.5)
+        ink = texture[np.where(inside, i, 0), np.where(inside, j, 0)]
+        return np.where(inside, 30 + 190 / 255 * ink, np.where(rim, 220.0, 100.0))
+
+    return shades
 
 
 def poses(rng, count=14, tilt=0.5, depth=(0.5, 0.75)):
@@ -146,18 +182,66 @@ def test_a_mount_that_is_not_measured_yet_is_asked_for(boards, tmp_path):
     assert float(mount.pitch) == pytest.approx(0.3) and float(mount.y) == pytest.approx(-0.02)
 
 
+def fitted_views(board, views):
+    """The fit to those views that show the board."""
+    views = [view for view in views if view is not None]
+    assert len(views) >= 9
+    return fit_camera(board, WIDTH, HEIGHT, [str(i) for i in range(len(views))], views)
+
+
 def test_another_board(rays):
     rng = np.random.default_rng(2)
     board = Board(7, 4, 0.05)
-    found = [
-        find_corners(render(rays, board, *pose, rng), board)
-        for pose in poses(rng, depth=(0.6, 0.9))
-    ]
-    found = [corners for corners in found if corners is not None]
-    assert len(found) >= 9
-    fit = fit_camera(board, WIDTH, HEIGHT, [str(i) for i in range(len(found))], found)
+    fit = fitted_views(
+        board,
+        [
+            find_points(render(rays, board, *pose, rng), board)
+            for pose in poses(rng, depth=(0.6, 0.9))
+        ],
+    )
     np.testing.assert_allclose(fit.intrinsics[:2], [270, 268], rtol=0.005)
     np.testing.assert_allclose(fit.intrinsics[2:], [161.5, 117.5], atol=1)
+
+
+OTHER_BOARDS = {
+    "circles": (Board(8, 6, 0.03, "circles"), circles, ""),
+    "acircles": (Board(4, 11, 0.02, "acircles"), circles, ""),
+    "charuco": (Board(7, 5, 0.05, "charuco", 0.037), charuco("4X4_50", False), "4X4_50"),
+    "charuco of old": (Board(7, 6, 0.045, "charuco", 0.034), charuco("5X5_1000", True), "5X5_50"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_BOARDS)
+def test_boards_that_are_no_chessboard(rays, name):
+    board, shades, dictionary = OTHER_BOARDS[name]
+    rng = np.random.default_rng(8)
+    images = [
+        render(rays, board, *pose, rng, shades) for pose in poses(rng, tilt=0.6, depth=(0.4, 0.6))
+    ]
+    board = recognise(board, images)
+    assert board.dictionary == dictionary and board.legacy == ("old" in name)
+    views = [find_points(image, board) for image in images]
+    fit = fitted_views(board, views)
+    np.testing.assert_allclose(fit.intrinsics[:2], [270, 268], rtol=0.005)
+    np.testing.assert_allclose(fit.intrinsics[2:], [161.5, 117.5], atol=1)
+    counts = {len(view.points) for view in views if view is not None}
+    assert len(counts) > 1 if dictionary else counts == {len(board.points)}  # parts of a ChArUco
+
+
+def test_the_command_with_a_charuco_board(rays, tmp_path, capfd):
+    board, shades, _ = OTHER_BOARDS["charuco"]
+    rng = np.random.default_rng(8)
+    images = [render(rays, board, *pose, rng, shades) for pose in poses(rng, 9, 0.6, (0.4, 0.6))]
+    folder, out = write(tmp_path / "views", images), tmp_path / "camera.yaml"
+    args = ["--board", "7x5", "--square", "0.05", "--pattern", "charuco", "--marker", "0.037"]
+    args += ["--mount", "height=0.6,pitch=1.5708", "-o", str(out)]
+    assert main(["calibrate", "camera", str(folder), *args]) == 0
+    assert "board 7x5 of 50 mm, markers of 4X4_50" in capfd.readouterr().out
+    np.testing.assert_allclose(np.diag(read_camera(out).camera.K)[:2], [270, 268], rtol=0.01)
+    assert out.with_suffix(".png").exists()
+    args[1] = "6x4"  # inner corners were counted
+    assert main(["calibrate", "camera", str(folder), *args]) == 2
+    assert "with --board 7x5 they are found" in capfd.readouterr().err
 
 
 def test_the_refined_corners_are_those_of_the_board(rays):
@@ -165,23 +249,23 @@ def test_the_refined_corners_are_those_of_the_board(rays):
     rotation, middle = np.array([0.3, -0.4, 0.1]), np.array([0.02, 0.01, 0.5])
     t = middle - cv2.Rodrigues(rotation)[0] @ BOARD.points.mean(0)
     true = cv2.projectPoints(BOARD.points, rotation, t, K, DISTORTION)[0].reshape(-1, 2)
-    found = find_corners(render(rays, BOARD, rotation, middle, rng), BOARD)
+    found = find_points(render(rays, BOARD, rotation, middle, rng), BOARD).corners
     away = np.hypot(*(found[:, None] - true).transpose(2, 0, 1)).min(1)
     assert np.sqrt(np.mean(away**2)) < 0.1
 
 
-def exact(rng, noise, **kind):
+def exact(rng, noise, distortion=DISTORTION, **kind):
     """Projected corners with noise, without any image."""
     corners = []
     for rotation, middle in poses(rng, **kind):
         t = middle - cv2.Rodrigues(rotation)[0] @ BOARD.points.mean(0)
-        points = cv2.projectPoints(BOARD.points, rotation, t, K, DISTORTION)[0].reshape(-1, 2)
+        points = cv2.projectPoints(BOARD.points, rotation, t, K, distortion)[0].reshape(-1, 2)
         corners.append(points + rng.normal(0, noise, points.shape))
-    return corners
+    return [Correspondences(BOARD.points, found) for found in corners]
 
 
-def fitted(corners):
-    return fit_camera(BOARD, WIDTH, HEIGHT, [str(i) for i in range(len(corners))], corners)
+def fitted(views):
+    return fit_camera(BOARD, WIDTH, HEIGHT, [str(i) for i in range(len(views))], views)
 
 
 def test_the_standard_deviations_are_those_of_the_errors():
@@ -195,6 +279,34 @@ def test_a_lens_without_k3_is_given_none():
     fit = fitted(exact(np.random.default_rng(3), 0.05))
     assert fit.distortion[4] == 0 and fit.distortion_sigma[4] == 0
     np.testing.assert_allclose(fit.distortion[0], -0.14, atol=0.02)
+
+
+def test_where_a_lens_turns_back():
+    turning = lambda *terms: turning_radius(K, np.array(terms), WIDTH, HEIGHT)
+    assert turning(0, 0, 0, 0, 0) is None and turning(0.3, 0.1, 0, 0, 0) is None
+    assert turning(*DISTORTION) is None
+    r = 1 / np.sqrt(3 * 0.8)  # the derivative 1 - 3 * 0.8 r² is zero there
+    assert turning(-0.8, 0, 0, 0, 0) == pytest.approx(269 * r * (1 - 0.8 * r**2))
+    assert turning(0.1, 0, 0, 0, -1.0) is not None
+    assert turning(-0.2, 0, 0, 0, 0) is None  # where it turns, 0.86, is beyond the corner, 0.76
+
+
+def test_a_k3_by_which_the_lens_would_turn_back_is_left_out():
+    """Views that keep to the middle of the image may speak for it."""
+    lens = np.array([-0.376, 0.9, 0.0, 0.0, -1.86])
+    assert turning_radius(K, lens, WIDTH, HEIGHT) == pytest.approx(153, abs=1)
+    fit = fitted(exact(np.random.default_rng(3), 0.02, lens, depth=(0.8, 1.0)))
+    assert fit.distortion[4] == 0 and fit.turning is None
+    np.testing.assert_allclose(fit.intrinsics[:2], [270, 268], rtol=0.01)
+
+
+def test_a_lens_that_turns_back_without_k3_is_judged():
+    lens = np.array([-0.6, 0.0, 0.0, 0.0, 0.0])
+    fit = fitted(exact(np.random.default_rng(3), 0.02, lens, depth=(0.8, 1.0)))
+    assert fit.turning == pytest.approx(turning_radius(K, lens, WIDTH, HEIGHT), rel=0.05)
+    verdict = judge(fit)
+    assert verdict.word == "usable"
+    assert f"the lens turns back {fit.turning:.0f} px from the centre" in verdict.sentence
 
 
 def test_views_that_are_all_alike_are_judged():
@@ -251,6 +363,26 @@ def test_a_board_that_is_none(refused, boards, board, sentence):
     assert sentence in refused(f"--board={board}", "--square", 0.03, images=two)
 
 
+@pytest.mark.parametrize(
+    "args, sentence",
+    [
+        (["--pattern", "charuco"], "--marker is missing; it must be the side"),
+        (["--pattern", "charuco", "--marker", "0.03"], "less than --square"),
+        (["--pattern", "charuco", "--marker", "nan"], "less than --square"),
+        (["--marker", "0.02"], "goes with --pattern charuco alone"),
+        (["--pattern", "circles"], "--board counts circles along and across"),
+        (["--pattern", "charuco", "--marker", "0.02"], "--board counts squares"),
+    ],
+)
+def test_a_pattern_that_is_not_there(refused, boards, args, sentence):
+    two = [boards / "00.png", boards / "01.png"]
+    assert sentence in refused(*ARGS, *args, images=two)
+
+
+def test_the_command_offers_every_pattern():
+    assert calibrate_camera.PATTERNS == PATTERNS
+
+
 @pytest.mark.parametrize("square", ["0", "-0.03", "nan", "inf", "30"])
 def test_a_square_that_is_none(refused, square):
     assert "in metres" in refused("--board", "9x6", f"--square={square}")
@@ -292,11 +424,22 @@ def test_images_that_are_none(refused, tmp_path):
     assert "found in 0 of 6 images, and 5 are needed" in refused(*ARGS, images=blank)
 
 
-def test_images_of_two_sizes(refused, boards, tmp_path):
+def test_images_of_another_size_than_most_are_left_out(boards, tmp_path, capfd):
+    large = cv2.resize(cv2.imread(str(boards / "00.png")), (640, 480))
+    cv2.imwrite(str(tmp_path / "a.png"), large)
+    some = [str(boards / f"{i:02d}.png") for i in range(7)]
+    args = ["calibrate", "camera", str(tmp_path / "a.png"), *some, *ARGS]
+    assert main([*args, "-o", str(tmp_path / "c.yaml")]) == 0
+    out = capfd.readouterr().out
+    assert "7 of 8 images of 320x240 used" in out
+    assert "left out: has 640x480 pixels and most have 320x240" in out
+
+
+def test_images_of_two_sizes_of_which_neither_is_that_of_most(refused, boards, tmp_path):
     large = cv2.resize(cv2.imread(str(boards / "00.png")), (640, 480))
     cv2.imwrite(str(tmp_path / "large.png"), large)
-    sentence = refused(*ARGS, images=[boards, tmp_path / "large.png"])
-    assert "large.png: has 640x480 pixels and 00.png 320x240" in sentence
+    sentence = refused(*ARGS, images=[boards / "00.png", tmp_path / "large.png"])
+    assert "as many images have 320x240 pixels as 640x480; give those of one size" in sentence
 
 
 def test_too_few_views(refused, boards):

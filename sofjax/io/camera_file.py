@@ -1,4 +1,4 @@
-"""`camera.yaml`: a ROS camera_info file, and under `mount:` where the camera sits on the robot."""
+"""`camera.yaml`: a calibration, and under `mount:` where the camera sits on the robot."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from sofjax.geometry import Camera, Mount
+from sofjax.io.camera_forms import camera_fields, lens, mapping, matrix, number, size
 from sofjax.io.errors import InputError, nearest
-from sofjax.io.text import SETTINGS_BYTES, read_text, write_atomically
-from sofjax.io.yaml_text import parse_yaml
+from sofjax.io.text import write_atomically
 
-MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # coefficients
-MOUNT_FIELDS = ("x", "y", "height", "pitch", "roll", "yaw")
+ANGLES = ("pitch", "roll", "yaw")
+MOUNT_FIELDS = ("x", "y", "height", *ANGLES)
 TO_FILL_IN = {  # what stands in a new file for what only the user knows
     "height": "fill in the metres from the floor to the lens",
     "pitch": "fill in the radians that the camera looks down",
 }
-MAX_PIXELS = 16384  # a side; more is a slip, and would fill the memory
+ROUNDING = 1e-3  # radians, by which an angle of three digits may be over its limit
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,9 @@ class CameraFile:
     camera: Camera  # of the undistorted image, which keeps K and the size
     mount: Mount
     distortion: np.ndarray  # [n] float64, in the order of OpenCV and ROS
-    distortion_model: str  # a key of MODELS
+    distortion_model: str  # plumb_bob, rational_polynomial or equidistant
     name: str
+    remarks: tuple[str, ...] = ()  # sentences on what the file left open
 
 
 def read_camera(path: Path) -> CameraFile:
@@ -40,19 +41,20 @@ def read_camera(path: Path) -> CameraFile:
     sees the floor.
     """
     path = Path(path)
-    text = read_text(path, "the camera file", SETTINGS_BYTES)
-    fields = _mapping(f"{path}", parse_yaml(text, str(path)))
-    width, height = (_size(path, fields, key) for key in ("image_width", "image_height"))
-    K = _intrinsics(path, fields, width, height)
-    model, distortion = _distortion(path, fields)
+    fields = camera_fields(path)
+    width, height = size(path, fields)
+    K = matrix(path, fields, width, height)
+    model, distortion, remarks = lens(path, fields)
     mount = _mount(path, fields)
     check_floor_in_view(f"{path}", K, width, height, mount)
+    name = fields.get("camera_name")
     return CameraFile(
         camera=Camera(jnp.asarray(K, float), width, height),
         mount=Mount.create(**mount),
         distortion=distortion,
         distortion_model=model,
-        name=str(fields.get("camera_name", path.parent.name)),
+        name=path.parent.name if name is None else str(name),
+        remarks=tuple(remarks),
     )
 
 
@@ -87,14 +89,15 @@ def write_intrinsics(
     - `mount`: metres and radians by the names of `Mount`'s fields.
     - `notes`: lines to stand as comments at the top.
     """
+    mount = {**mount, **_canonical({key: mount[key] for key in ANGLES if key in mount})}
     placed = ", ".join(
         f"{key}: {_shortest(mount[key]) if key in mount else TO_FILL_IN.get(key, 0.0)}"
         for key in MOUNT_FIELDS
     )
     K = ", ".join(map(_shortest, np.asarray(camera.K).ravel()))
     data = ", ".join(map(_shortest, distortion))
-    name = "".join(c for c in name if c.isprintable()).replace("'", "''")
-    comments = "".join(f"# {note}\n" for note in notes)
+    name = _printable(name).replace("'", "''")
+    comments = "".join(f"# {_printable(note)}\n" for note in notes)
     write_atomically(
         Path(path),
         "# camera_info, with the mount of the camera on the robot: metres, radians, "
@@ -125,9 +128,7 @@ def mount_fields(where: str, text: str) -> dict[str, float]:
 
 def known_mount(path: Path) -> dict[str, float]:
     """The fields of the mount in a camera file that are filled in; none if there is no mount."""
-    text = read_text(path, "the camera file", SETTINGS_BYTES)
-    fields = _mapping(f"{path}", parse_yaml(text, str(path)))
-    mount = _mapping(f"{path}: 'mount'", fields.get("mount", {}))
+    mount = mapping(f"{path}: 'mount'", camera_fields(path).get("mount", {}))
     return _mount_numbers(f"{path}: 'mount'", mount)
 
 
@@ -136,7 +137,7 @@ def doubts(camera_file: CameraFile) -> list[str]:
     camera, mount = camera_file.camera, camera_file.mount
     size = np.array([camera.width, camera.height])
     K = np.asarray(camera.K, float)
-    found = []
+    found = list(camera_file.remarks)
     off = np.abs(K[:2, 2] / size - 0.5)
     if off.max() > 0.2:
         found.append(
@@ -173,85 +174,13 @@ def horizon_image(K: np.ndarray, pitch: float, roll: float) -> np.ndarray:
     return np.linalg.solve(np.asarray(K, float).T, np.array(down))  # down · K^-1 x = l · x
 
 
-def _mapping(where: str, value: object) -> Mapping:
-    if not isinstance(value, Mapping):
-        raise InputError(f"{where}: must hold 'name: value' pairs, as a ROS camera_info file does")
-    return value
-
-
-def _field(path: Path, fields: Mapping, key: str) -> object:
-    if key not in fields:
-        known = [str(k) for k in fields]
-        close = nearest(key, known) if known else ""
-        hint = f"; {close}" if close.startswith("did") else ""
-        raise InputError(f"{path}: the field '{key}' is missing{hint}")
-    return fields[key]
-
-
-def _size(path: Path, fields: Mapping, key: str) -> int:
-    value = _field(path, fields, key)
-    if isinstance(value, bool) or not isinstance(value, int) or not 8 <= value <= MAX_PIXELS:
-        right = f"it must be whole pixels, from 8 to {MAX_PIXELS}"
-        raise InputError(f"{path}: '{key}' is {value!r:.60}; {right}")
-    return value
-
-
-def _number(where: str, value: object) -> float:
-    """A finite number; YAML 1.1 takes '1e-5' for a word, as calibration tools write it."""
-    try:
-        number = float("no" if isinstance(value, bool) else value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{where} is {value!r:.60}; it must be a number") from None
-    if not math.isfinite(number):
-        raise InputError(f"{where} is {number}; it must be finite")
-    return number
-
-
-def _matrix(path: Path, fields: Mapping, key: str, sizes: tuple[int, ...] | None) -> np.ndarray:
-    """The data of `key: {rows, cols, data}`, or of a bare list."""
-    value = _field(path, fields, key)
-    data = value.get("data") if isinstance(value, Mapping) else value
-    if not isinstance(data, list):
-        raise InputError(f"{path}: '{key}' must have 'data: [...]', a list of numbers")
-    if sizes is not None and len(data) not in sizes:
-        right = " or ".join(map(str, sizes))
-        raise InputError(f"{path}: '{key}' has {len(data)} numbers and must have {right}")
-    return np.array([_number(f"{path}: a number of '{key}'", v) for v in data])
-
-
-def _intrinsics(path: Path, fields: Mapping, width: int, height: int) -> np.ndarray:
-    K = _matrix(path, fields, "camera_matrix", (9,)).reshape(3, 3)
-    shape = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 1]])
-    if (K[shape == 0] != 0).any() or K[2, 2] != 1:
-        right = "[fx, 0, cx, 0, fy, cy, 0, 0, 1]"
-        raise InputError(f"{path}: 'camera_matrix' must have the form {right}")
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise InputError(f"{path}: the focal lengths of 'camera_matrix' must be positive pixels")
-    centre, size = K[:2, 2], np.array([width, height])
-    if (centre < 0.1 * size).any() or (centre > 0.9 * size).any():
-        raise InputError(
-            f"{path}: the principal point ({centre[0]:g}, {centre[1]:g}) of 'camera_matrix' is not "
-            f"in the middle of a {width}x{height} image; the matrix must be that of this image size"
-        )
-    return K
-
-
-def _distortion(path: Path, fields: Mapping) -> tuple[str, np.ndarray]:
-    model = _field(path, fields, "distortion_model")
-    if not isinstance(model, str) or model not in MODELS:
-        raise InputError(
-            f"{path}: 'distortion_model' is {model!r:.60}; it must be one of {', '.join(MODELS)}"
-        )
-    return model, _matrix(path, fields, "distortion_coefficients", MODELS[model])
-
-
 def _mount(path: Path, fields: Mapping) -> dict[str, float]:
     if "mount" not in fields:
         raise InputError(
             f"{path}: the field 'mount' is missing; it says where the camera sits on the robot, "
             "such as 'mount: {x: 0.1, y: 0, height: 0.6, pitch: 0.26, roll: 0, yaw: 0}'"
         )
-    given = _mapping(f"{path}: 'mount'", fields["mount"])
+    given = mapping(f"{path}: 'mount'", fields["mount"])
     mount = _mount_numbers(f"{path}: 'mount'", given)
     for key, what in TO_FILL_IN.items():
         if key not in mount:
@@ -266,7 +195,7 @@ def _mount_numbers(where: str, given: Mapping) -> dict[str, float]:
         if key not in MOUNT_FIELDS:
             hint = nearest(str(key), MOUNT_FIELDS)
             raise InputError(f"{where} has no field {key!r:.60}; {hint}")
-    mount = {key: _number(f"{where}: '{key}'", value) for key, value in given.items()}
+    mount = {key: number(f"{where}: '{key}'", value) for key, value in given.items()}
     if not 0 < mount.get("height", 1.0) <= 100:
         raise InputError(
             f"{where}: 'height' is {mount['height']:g}; it must be the metres of the camera "
@@ -275,13 +204,46 @@ def _mount_numbers(where: str, given: Mapping) -> dict[str, float]:
     for key in ("x", "y"):
         if abs(mount.get(key, 0.0)) > 100:
             raise InputError(f"{where}: '{key}' is {mount[key]:g}; it must be in metres")
-    for key, limit in (("pitch", math.pi / 2), ("roll", math.pi), ("yaw", 2 * math.pi)):
-        if abs(mount.get(key, 0.0)) > limit:
+    for key, limit, words in (
+        ("pitch", math.pi / 2, "a quarter"),
+        ("roll", 2 * math.pi, "a full"),
+        ("yaw", 2 * math.pi, "a full"),
+    ):
+        if abs(mount.get(key, 0.0)) > limit + ROUNDING:
             raise InputError(
-                f"{where}: '{key}' is {mount[key]:g}; angles are in radians, at most "
-                f"{limit:.4f} either way (15 degrees are 0.2618)"
+                f"{where}: '{key}' is {mount[key]:g}; angles are in radians, at most {words} "
+                f"turn, {limit:.4f}, either way (15 degrees are 0.2618)"
             )
-    return mount
+    return mount | _canonical({key: mount[key] for key in ANGLES if key in mount})
+
+
+def _canonical(angles: Mapping[str, object]) -> dict[str, object]:
+    """The same tilt with the pitch in [-pi/2, pi/2], and roll and yaw in (-pi, pi], radians.
+
+    A pitch that is over its limit by no more than `ROUNDING` is taken for the limit. An angle that
+    is within its limits stays the number that it is.
+    """
+    turned = {key: float(value) for key, value in angles.items()}
+    if "pitch" in turned:
+        pitch = turned["pitch"] = _wrapped(turned["pitch"])
+        if abs(pitch) > math.pi / 2 + ROUNDING:  # over the vertical: the other way, upside down
+            turned["pitch"] = math.copysign(math.pi, pitch) - pitch
+            turned |= {key: turned.get(key, 0.0) + math.pi for key in ("roll", "yaw")}
+        else:
+            turned["pitch"] = min(max(pitch, -math.pi / 2), math.pi / 2)
+    turned |= {key: _wrapped(turned[key]) for key in ("roll", "yaw") if key in turned}
+    kept = {key: value for key, value in angles.items() if turned[key] == float(value)}
+    return turned | kept
+
+
+def _wrapped(angle: float) -> float:
+    """The same direction in (-pi, pi], radians; half a turn to float32's digits is pi."""
+    wrapped = math.remainder(angle, 2 * math.pi)
+    return math.pi if abs(wrapped) > math.pi - 3e-7 else wrapped
+
+
+def _printable(text: str) -> str:
+    return "".join(c for c in text if c.isprintable())
 
 
 def _shortest(value: object) -> str:

@@ -35,10 +35,19 @@ class _Loader(yaml.SafeLoader):
         return mapping
 
 
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
+
+
 def parse_yaml(text: str, where: str) -> object:
-    """The data of one YAML document; `where` names the file in the sentence of the error."""
+    """The data of a YAML text; `where` names the file in the sentence of the error.
+
+    OpenCV's header and its tag of a matrix are passed over. Documents that `---` parts are taken
+    together if no name is in two of them: ROS ends a message by it, and a user adds to that.
+    """
+    if text.startswith("%YAML:"):  # of OpenCV, and no YAML
+        text = f"#{text}"
     try:
-        return yaml.load(text, Loader=_Loader)  # a SafeLoader
+        documents = list(yaml.load_all(text, Loader=_Loader))  # a SafeLoader
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""
@@ -46,3 +55,13 @@ def parse_yaml(text: str, where: str) -> object:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{where}: not plain YAML: {first}") from None
+    documents = [data for data in documents if data is not None]
+    if len(documents) > 1 and all(isinstance(data, dict) for data in documents):
+        joined = {key: value for data in documents for key, value in data.items()}
+        if len(joined) == sum(map(len, documents)):
+            return joined
+    if len(documents) > 1:
+        raise InputError(
+            f"{where}: {len(documents)} documents parted by '---' have the same names; keep one"
+        )
+    return documents[0] if documents else None

@@ -1,4 +1,4 @@
-"""Intrinsics from views of a checkerboard, "a common checkboard method" of section IV."""
+"""Intrinsics from views of a board, "a common checkboard method" of section IV."""
 
 import math
 from dataclasses import dataclass
@@ -6,33 +6,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sofjax.vision.boards import Board, Correspondences
+
 MIN_VIEWS = 5
-WINDOW = 0.4  # of the way to the next corner, within which one is refined ...
-MAX_WINDOW = 11  # ... in pixels at most: farther out the lens bends the lines
 OUTLIER = 3.0  # times the median error of the views
 NEGLIGIBLE = 0.1  # pixels, below which no view is an outlier
 MIN_TILT = 10.0  # degrees, below which focal length and distance cannot be told apart
 SIGNIFICANT = 2.0  # standard deviations from 0 without which k3 is left out
 TERMS = ("k1", "k2", "p1", "p2", "k3")
-
-
-@dataclass(frozen=True)
-class Board:
-    """A checkerboard, by its inner corners: those at which four squares meet."""
-
-    columns: int
-    rows: int
-    square: float  # metres
-
-    @property
-    def points(self) -> np.ndarray:
-        """[N, 3] corners in the board's frame, row after row, metres."""
-        rows, columns = np.mgrid[: self.rows, : self.columns]
-        flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1)
-        return self.square * flat.reshape(-1, 3).astype(np.float32)
-
-    def __str__(self) -> str:
-        return f"{self.columns}x{self.rows}"
 
 
 @dataclass(frozen=True)
@@ -71,43 +52,26 @@ class CameraFit:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
     @property
+    def turning(self) -> float | None:
+        """Pixels from the centre at which the lens turns back, if that is within the image."""
+        return turning_radius(self.K, self.distortion, self.width, self.height)
+
+    @property
     def focal_uncertainty(self) -> float:
         """Standard deviation of the focal length, as a share of it."""
         return float((self.intrinsics_sigma[:2] / self.intrinsics[:2]).max())
 
 
-def find_corners(image: np.ndarray, board: Board) -> np.ndarray | None:
-    """Corners [N, 2] in the order of the board's, pixels; None unless all of them are in view.
-
-    Found by OpenCV's sector-based search, or else by its older one, then refined where the edges
-    around each cross, within a window that no other corner reaches into.
-    """
-    size = (board.columns, board.rows)
-    search = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    found, corners = cv2.findChessboardCornersSB(image, size, flags=search)
-    if not found:
-        search = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, corners = cv2.findChessboardCorners(image, size, flags=search)
-    if not found:
-        return None
-    grid = corners.reshape(board.rows, board.columns, 2)
-    gap = min(np.linalg.norm(np.diff(grid, axis=a), axis=-1).min() for a in (0, 1))
-    window = int(np.clip(WINDOW * gap, 2, MAX_WINDOW))
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
-    refined = cv2.cornerSubPix(image, np.float32(corners).copy(), (window, window), (-1, -1), stop)
-    return refined.reshape(-1, 2)
-
-
 def fit_camera(
-    board: Board, width: int, height: int, names: list[str], corners: list[np.ndarray]
+    board: Board, width: int, height: int, names: list[str], found: list[Correspondences]
 ) -> CameraFit:
-    """Intrinsics from the corners [N, 2] of some views; views that do not go with the others go.
+    """Intrinsics from what some views show; views that do not go with the others are left out.
 
     **Raises:** `ValueError` if OpenCV finds no camera that could have taken them.
     """
-    used = list(range(len(corners)))
+    used = list(range(len(found)))
     while True:
-        solution = _solve(board, width, height, [corners[i] for i in used])
+        solution = _solve(width, height, [found[i] for i in used])
         errors = solution.errors
         worst = int(errors.argmax())
         limit = max(OUTLIER * float(np.median(errors)), NEGLIGIBLE)
@@ -116,8 +80,8 @@ def fit_camera(
         del used[worst]
     poses = dict(zip(used, solution.poses, strict=True))
     views = [
-        _view(board, solution, name, found, poses.get(i))
-        for i, (name, found) in enumerate(zip(names, corners, strict=True))
+        _view(board, solution, name, seen, poses.get(i))
+        for i, (name, seen) in enumerate(zip(names, found, strict=True))
     ]
     return CameraFit(
         width,
@@ -141,13 +105,16 @@ class _Solution:
     error: float
 
 
-def _solve(board: Board, width: int, height: int, corners: list[np.ndarray]) -> _Solution:
-    """One fit; k3 is zero unless the views speak for it: far from the corners it runs away."""
+def _solve(width: int, height: int, found: list[Correspondences]) -> _Solution:
+    """One fit; k3 is zero unless the views speak for it: far from the corners it runs away.
+
+    It is zero too where by it the lens would turn back within the image, which no lens does.
+    """
     for flags in (0, cv2.CALIB_FIX_K3):
         try:
             error, K, distortion, R, t, sigma, _, errors = cv2.calibrateCameraExtended(
-                [board.points] * len(corners),
-                [np.float32(found) for found in corners],
+                [seen.points for seen in found],
+                [np.float32(seen.corners) for seen in found],
                 (width, height),
                 None,
                 None,
@@ -158,24 +125,45 @@ def _solve(board: Board, width: int, height: int, corners: list[np.ndarray]) -> 
         sigma, distortion = sigma.ravel()[:9], distortion.ravel()[:5]
         if not (np.isfinite(K).all() and np.isfinite(sigma).all() and math.isfinite(error)):
             raise ValueError("no camera explains these views of the board")
-        if abs(distortion[4]) > SIGNIFICANT * sigma[8]:
+        spoken_for = abs(distortion[4]) > SIGNIFICANT * sigma[8]
+        if spoken_for and turning_radius(K, distortion, width, height) is None:
             break
     poses = list(zip(R, t, strict=True))
     return _Solution(K, distortion, sigma, poses, errors.ravel(), float(error))
 
 
+def turning_radius(K: np.ndarray, distortion: np.ndarray, width: int, height: int) -> float | None:
+    """Pixels from the centre at which a plumb_bob lens turns back, if that is within the image.
+
+    With r the distance from the axis at a depth of 1, the lens shows it at
+    r (1 + k1 r² + k2 r⁴ + k3 r⁶), which must grow until it is at the farthest corner.
+    """
+    k1, k2, _, _, k3 = distortion
+    slopes = np.roots([7 * k3, 5 * k2, 3 * k1, 1])  # of which r² the derivative is zero
+    turns = slopes[(abs(slopes.imag) < 1e-9) & (slopes.real > 0)].real
+    if not len(turns):
+        return None
+    s = turns.min()
+    reached = math.sqrt(s) * (1 + s * (k1 + s * (k2 + s * k3)))
+    focal = np.diag(K)[:2]
+    corners = np.array([[x, y] for x in (0, width - 1) for y in (0, height - 1)])
+    farthest = np.linalg.norm((corners - K[:2, 2]) / focal, axis=1).max()
+    return None if reached >= farthest else float(reached * focal.mean())
+
+
 def _view(
-    board: Board, solution: _Solution, name: str, corners: np.ndarray, pose: tuple | None
+    board: Board, solution: _Solution, name: str, seen: Correspondences, pose: tuple | None
 ) -> BoardView:
     """A view under the final camera; where it was no part of the fit, with its own best pose."""
     camera = solution.K, solution.distortion
-    R, t = pose or cv2.solvePnP(board.points, np.float32(corners), *camera)[1:]
-    projected = cv2.projectPoints(board.points, R, t, *camera)[0].reshape(-1, 2)
+    R, t = pose or cv2.solvePnP(seen.points, np.float32(seen.corners), *camera)[1:]
+    projected = cv2.projectPoints(seen.points, R, t, *camera)[0].reshape(-1, 2)
     rotation = cv2.Rodrigues(R)[0]
     middle = rotation @ board.points.mean(0) + t.ravel()
     distance = float(np.linalg.norm(middle))
     facing = min(abs(float(rotation[:, 2] @ middle)) / distance, 1.0)
-    return BoardView(name, corners, corners - projected, distance, math.acos(facing), bool(pose))
+    residuals = seen.corners - projected
+    return BoardView(name, seen.corners, residuals, distance, math.acos(facing), bool(pose))
 
 
 @dataclass(frozen=True)
@@ -218,6 +206,11 @@ def judge(fit: CameraFit) -> Verdict:
         advice.append(
             f"the residuals of {fit.error:.2f} px are large: is the board flat, are the images "
             "sharp, is the lens a fisheye?"
+        )
+    if fit.turning is not None:
+        advice.append(
+            f"the lens turns back {fit.turning:.0f} px from the centre, within the image, as no "
+            "lens does: take views that reach the corners"
         )
     off = float(np.abs(np.array([cx, cy]) / size - 0.5).max())
     if tilt < MIN_TILT:  # the fit may then rest far from the truth, and the sigmas do not tell
