@@ -58,6 +58,8 @@ def read_drive(path: Path) -> Drive:
         counted["groundtruth.txt"] = truth.nanoseconds
         remarks += truth.remarks
     _check_units(path, counted)
+    if nanoseconds:
+        remarks.append("the timestamps are nanoseconds, and were read as such")
     span = read.trajectory.span()
     if outside(read.trajectory, stamps).all():
         raise InputError(

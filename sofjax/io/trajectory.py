@@ -56,8 +56,7 @@ def read_trajectory(path: Path, what: str = "a trajectory") -> Trajectory:
 def read_trajectory_file(path: Path, what: str) -> TrajectoryFile:
     """Read a TUM file of the robot's poses; heights and tilts are left out.
 
-    Rows that stand there twice are dropped, and stamps in nanoseconds become seconds, with a
-    remark each.
+    Rows that stand there twice are dropped, with a remark, and nanoseconds become seconds.
 
     **Raises:** `InputError` that names the line for anything but rows of 8 finite numbers with
     increasing stamps, unit quaternions and the z axis up.
@@ -73,7 +72,6 @@ def read_trajectory_file(path: Path, what: str) -> TrajectoryFile:
     nanoseconds = in_nanoseconds(stamps)
     if nanoseconds:
         stamps = 1e-9 * stamps
-        remarks.append(f"{path.name}: its timestamps are nanoseconds, and were read as such")
     yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
     trajectory = Trajectory(stamps, np.stack([x, y], axis=-1), np.unwrap(yaw))
     return TrajectoryFile(trajectory, np.array(numbers)[kept], nanoseconds, remarks)
