@@ -19,6 +19,9 @@ TO_FILL_IN = {  # what stands in a new file for what only the user knows
     "height": "fill in the metres from the floor to the lens",
     "pitch": "fill in the radians that the camera looks down",
 }
+FIRST_LINE = (  # of every camera file that is written here
+    "# camera_info, with the mount of the camera on the robot: metres, radians, pitch > 0 looks down"
+)
 MAX_PIXELS = 16384  # a side; more is a slip, and would fill the memory
 
 
@@ -97,8 +100,7 @@ def write_intrinsics(
     comments = "".join(f"# {note}\n" for note in notes)
     write_atomically(
         Path(path),
-        "# camera_info, with the mount of the camera on the robot: metres, radians, "
-        "pitch > 0 looks down\n"
+        f"{FIRST_LINE}\n"
         f"{comments}"
         f"image_width: {camera.width}\n"
         f"image_height: {camera.height}\n"

@@ -1,5 +1,6 @@
 """Trajectories in the TUM form: one row a pose, `timestamp tx ty tz qx qy qz qw`."""
 
+import contextlib
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,15 +106,32 @@ def _row(stamp: float, xy: np.ndarray, yaw: float) -> str:
 
 
 class TrajectoryWriter:
-    """Writes rows as they come, each one complete on the disk before the next."""
+    """Writes rows as they come, each one complete on the disk before the next.
+
+    **Raises:** `OSError` that names the file, such as for a full disk; the file then ends with the
+    last row that had room.
+    """
 
     def __init__(self, path: Path):
-        self._file = open(path, "w", encoding="utf-8", buffering=1)
-        self._file.write(HEAD)
+        self._path, self._size = path, 0
+        self._file = open(path, "wb", buffering=0)
+        self._append(HEAD)
 
     def write(self, stamp: float, xy: np.ndarray, yaw: float) -> None:
         """One pose: seconds, metres, radians."""
-        self._file.write(_row(stamp, xy, yaw))
+        self._append(_row(stamp, xy, yaw))
+
+    def _append(self, row: str) -> None:
+        left = row.encode()
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            with contextlib.suppress(OSError):  # of what is no regular file
+                self._file.truncate(self._size)  # a part of the row may have had room
+            error.filename = str(self._path)
+            raise
+        self._size += len(row.encode())
 
     def close(self) -> None:
         self._file.close()
