@@ -33,10 +33,11 @@ def run(args: argparse.Namespace) -> int:
     from sofjax.vision import Frontend, check_images, read_image
 
     drive = read_drive(args.drive)
+    out = args.out or Path("runs") / f"{drive.name}-inspect.png"
+    outputs.check_figure(out)
     check_images(drive)
     unreadable = [file for file in drive.image_files if read_image(file) is None]
     print(describe(drive, unreadable))
-    out = args.out or Path("runs") / f"{drive.name}-inspect.png"
     outputs.check_writable(out.parent)
     if not viewer.available():
         print(f"sofjax: {viewer.MISSING}", file=sys.stderr)

@@ -1,7 +1,7 @@
 """Ctrl-C and SIGTERM: when they stop a command, and its exit code then.
 
-`main` listens while a command runs. A signal raises `KeyboardInterrupt`, but neither while a module is
-being imported (half imported, it would fail in its own ways) nor in a block of `held`: there it
+`main` listens while a command runs. A signal raises `KeyboardInterrupt`, but neither while a module
+is being imported (half imported, it would fail in its own ways) nor in a block of `held`: there it
 waits. Where Python swallows the exception, as in callbacks of the garbage collector, it is raised
 again a little later. Who sends a second signal is not kept waiting.
 """
@@ -29,11 +29,13 @@ class _Listener:
         self.held = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        now = time.monotonic()
+        second = False
         if number in STOP:
-            self.pending, self.code = True, 128 + number
-            self.first = self.first or now
-        second = number in STOP and now - self.first > SECOND
+            now = time.monotonic()
+            if self.first is not None and now - self.first < SECOND:
+                return
+            second = self.first is not None
+            self.first, self.pending, self.code = self.first or now, True, 128 + number
         if self.held and not second:
             return
         if _importing(frame) and not second:

@@ -20,7 +20,8 @@ TO_FILL_IN = {  # what stands in a new file for what only the user knows
     "pitch": "fill in the radians that the camera looks down",
 }
 FIRST_LINE = (  # of every camera file that is written here
-    "# camera_info, with the mount of the camera on the robot: metres, radians, pitch > 0 looks down"
+    "# camera_info, with the mount of the camera on the robot: metres, radians, "
+    "pitch > 0 looks down"
 )
 MAX_PIXELS = 16384  # a side; more is a slip, and would fill the memory
 

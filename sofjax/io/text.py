@@ -53,7 +53,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     A reader sees the old content or the new, never a part. The new file has a name of its own
     until then, so that nothing else is overwritten.
 
-    **Raises:** `OSError` that names `path`, such as for a full disk; the old file is then as it was.
+    **Raises:** `OSError` that names `path`, such as for a full disk; the old file is as it was.
     """
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
     try:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sofjax.io.text import replacing
 
-SOFTWARE = "sofjax"
+SIGNATURE = b"Software\0sofjax"  # in the first bytes of every figure
 
 
 def new_figure(size: tuple[float, float], rows: int = 1, columns: int = 1):
@@ -37,5 +37,5 @@ def save(figure, path: Path) -> None:
     """Write a PNG whole or not at all; its metadata say that sofjax has written it."""
     with replacing(path) as file:
         figure.savefig(
-            file, dpi=150, format="png", bbox_inches="tight", metadata={"Software": SOFTWARE}
+            file, dpi=150, format="png", bbox_inches="tight", metadata={"Software": "sofjax"}
         )
