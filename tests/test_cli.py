@@ -277,7 +277,7 @@ def test_ctrl_c_before_the_first_image(tmp_path, drive, monkeypatch):
 
     monkeypatch.setattr("sofjax.cli.run.views", interrupted)
     assert run(drive, "--out", tmp_path) == 130
-    assert {path.name for path in tmp_path.iterdir()} == FILES - {"map.png"}
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"map.png", "trajectory.txt"}
     assert report_of(tmp_path)["funnel"]["images"] == 0
 
 

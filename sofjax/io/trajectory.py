@@ -3,6 +3,7 @@
 import contextlib
 import math
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 
 import numpy as np
@@ -108,33 +109,33 @@ def _row(stamp: float, xy: np.ndarray, yaw: float) -> str:
 class TrajectoryWriter:
     """Writes rows as they come, each one complete on the disk before the next.
 
-    **Raises:** `OSError` that names the file, such as for a full disk; the file then ends with the
-    last row that had room.
+    The file is made with the first row. Where there is no room for a row, such as on a full disk,
+    the file ends with the row before, and the `OSError` names the file.
     """
 
     def __init__(self, path: Path):
         self._path, self._size = path, 0
-        self._file = open(path, "wb", buffering=0)
-        self._append(HEAD)
+        self._file: FileIO | None = None
 
     def write(self, stamp: float, xy: np.ndarray, yaw: float) -> None:
         """One pose: seconds, metres, radians."""
-        self._append(_row(stamp, xy, yaw))
-
-    def _append(self, row: str) -> None:
-        left = row.encode()
+        row = _row(stamp, xy, yaw)
+        if self._file is None:
+            self._file, row = open(self._path, "wb", buffering=0), HEAD + row
+        left = data = row.encode()
         try:
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            with contextlib.suppress(OSError):  # of what is no regular file
+            with contextlib.suppress(OSError):  # what is no regular file cannot be cut
                 self._file.truncate(self._size)  # a part of the row may have had room
             error.filename = str(self._path)
             raise
-        self._size += len(row.encode())
+        self._size += len(data)
 
     def close(self) -> None:
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
     def __enter__(self) -> "TrajectoryWriter":
         return self
