@@ -1,5 +1,6 @@
 """The program: `sofjax`, and `python -m sofjax`."""
 
+import contextlib
 import os
 import signal
 import sys
@@ -12,7 +13,12 @@ def main() -> int:
             signal.signal(number, _leave)
     from sofjax.cli import main
 
-    return main()
+    code = main()
+    if code > 128:  # a compilation that was cut short has a thread, and the end would wait for it
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+        os._exit(code)
+    return code
 
 
 def _leave(number: int, _: object) -> None:

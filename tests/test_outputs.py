@@ -491,6 +491,16 @@ def test_what_the_parent_ignores_stays_ignored():
         signal.signal(signal.SIGINT, usual)
 
 
+def test_a_stopped_command_does_not_wait_for_its_threads():
+    program = "import sys, threading, sofjax.cli, sofjax.__main__\n"
+    program += "timer = threading.Timer(100, print)\n"
+    program += "sofjax.cli.main = lambda: timer.start() or print('said') or 143\n"
+    program += "sys.exit(sofjax.__main__.main())"
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "said\n", "")
+
+
 # Killed
 
 
@@ -520,10 +530,12 @@ def test_a_run_ended_while_it_solves_has_its_map_and_report(number, drive, tmp_p
 
 @pytest.mark.slow
 def test_a_run_may_be_killed_at_any_moment(drive, tmp_path):
-    assert start(drive, tmp_path / "whole").wait() == 0  # compiles all that the others read
-    begun = time.monotonic()
-    assert start(drive, tmp_path / "again").wait() == 0
-    life = time.monotonic() - begun
+    for out in ("whole", "again"):  # the first compiles what the others read
+        begun = time.monotonic()
+        whole = start(drive, tmp_path / out)
+        whole.communicate()
+        assert whole.returncode == 0
+        life = time.monotonic() - begun
     draw, reached = random.Random(0), set()
     for i in range(20):
         out = tmp_path / str(i)
