@@ -456,7 +456,7 @@ def test_an_output_that_cannot_be_written(refused, tmp_path):
 def test_an_output_that_is_another_file(refused, tmp_path):
     notes = tmp_path / "notes.txt"
     notes.write_text("my notes")
-    assert "must hold 'name: value' pairs" in refused(*ARGS, "-o", notes)
+    assert "no camera file that sofjax has written" in refused(*ARGS, "-o", notes)
     assert notes.read_text() == "my notes"
 
 

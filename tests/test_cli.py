@@ -25,7 +25,7 @@ from sofjax.io.trajectory import read_trajectory
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 IMAGES = 40
 SMALL = ["--particles", "50", "--loop", "none"]  # the smoothing takes its time to compile
-FILES = {"trajectory.txt", "map.geojson", "map.png", "report.json", "config.toml"}
+FILES = {"trajectory.txt", "map.geojson", "map.png", "report.json", "config.toml", ".sofjax-run"}
 
 
 def make_drive(drive, images=IMAGES):
@@ -60,7 +60,7 @@ def done(drive, tmp_path_factory):
     return folder
 
 
-def test_a_run_writes_its_six_files_and_no_more(done):
+def test_a_run_writes_its_six_files_a_marker_and_no_more(done):
     assert {path.name for path in done.iterdir()} == FILES | {"trajectory_smoothed.txt"}
 
 
@@ -124,7 +124,7 @@ def test_the_report_counts_the_funnel_and_the_errors(done):
 def test_the_config_of_a_run_gives_the_same_files_again(done, drive, tmp_path):
     args = ["run", str(drive), "--out", str(tmp_path), "--config", str(done / "config.toml")]
     assert main(args) == 0
-    for name in sorted(FILES - {"report.json"} | {"trajectory_smoothed.txt"}):
+    for name in sorted(FILES - {"report.json", ".sofjax-run"} | {"trajectory_smoothed.txt"}):
         assert (tmp_path / name).read_bytes() == (done / name).read_bytes(), name
 
 
@@ -177,8 +177,12 @@ def test_results_go_to_a_folder_of_their_own_by_default(drive, tmp_path, monkeyp
 
 def test_what_an_earlier_run_left_is_not_mixed_with_the_new(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(viewer, "available", lambda: False)
-    (tmp_path / "map.png").write_text("old")
     (tmp_path / "notes.txt").write_text("mine")
+    assert run(drive, "--out", tmp_path) == 0
+    # a figure of the first run, as with matplotlib it would have drawn
+    with open(tmp_path / ".sofjax-run", "a") as marker:
+        marker.write("map.png\n")
+    (tmp_path / "map.png").write_text("old")
     assert run(drive, "--out", tmp_path) == 0
     assert {p.name for p in tmp_path.iterdir()} == FILES - {"map.png"} | {"notes.txt"}
 
@@ -273,7 +277,7 @@ def test_ctrl_c_before_the_first_image(tmp_path, drive, monkeypatch):
 
     monkeypatch.setattr("sofjax.cli.run.views", interrupted)
     assert run(drive, "--out", tmp_path) == 130
-    assert {path.name for path in tmp_path.iterdir()} == FILES - {"map.png"}
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"map.png", "trajectory.txt"}
     assert report_of(tmp_path)["funnel"]["images"] == 0
 
 

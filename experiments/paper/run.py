@@ -47,11 +47,13 @@ FIGURE = ("paper", "paper-closed", "defaults", "defaults-smooth")
 
 def report_of(drive: Path, folder: Path, options: list[str]) -> dict:
     """Run, unless that has been done."""
-    if not (folder / "report.json").exists():
+    path = folder / "report.json"
+    done = path.exists() and json.loads(path.read_text())["loop"].get("status") != "not finished"
+    if not done:
         code = sofjax(["run", str(drive), "--out", str(folder), *options])
         if code:
             raise SystemExit(code)
-    return json.loads((folder / "report.json").read_text())
+    return json.loads(path.read_text())
 
 
 def figures_of(report: dict) -> dict:

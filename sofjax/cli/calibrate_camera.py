@@ -61,7 +61,7 @@ def add_parser(parts: argparse._SubParsersAction) -> None:
         type=Path,
         default=Path("camera.yaml"),
         help="the camera file; default camera.yaml. The mount that it has already is kept, and a "
-        "figure is drawn beside it",
+        "figure is drawn beside it. Files that sofjax has not written are not replaced",
     )
     parser.add_argument(
         "--mount",
@@ -81,6 +81,9 @@ def run(args: argparse.Namespace) -> int:
     board = board_images.board(args)
     if args.out.is_dir():
         raise InputError(f"{args.out}: is a folder; -o must name a file, such as camera.yaml")
+    figure = args.out.with_suffix(".png")
+    outputs.check_camera(args.out)
+    outputs.check_figure(figure)
     mount = known_mount(args.out) if args.out.exists() else {}
     mount |= mount_fields("--mount", args.mount) if args.mount is not None else {}
     found = board_images.look(board_images.files(args.images), board)
@@ -93,8 +96,10 @@ def run(args: argparse.Namespace) -> int:
         return REFUSED
     board, verdict = found.board, judge(fit)
     print(summary(board, fit, verdict, found.left_out))
-
-    figure = args.out.with_suffix(".png")
+    if verdict.usable:
+        _write(args.out, board, fit, mount)
+    else:
+        print(f"{args.out} is not written")
     if viewer.available():
         used = [view.used for view in fit.views]
         viewer.draw_corners(
@@ -109,11 +114,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"drawn to {figure}")
     else:
         print(viewer.MISSING)
-    if not verdict.usable:
-        print(f"{args.out} is not written")
-        return REFUSED
-    _write(args.out, board, fit, mount)
-    return 0
+    return 0 if verdict.usable else REFUSED
 
 
 def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict) -> None:

@@ -56,7 +56,8 @@ def add_parser(parts: argparse._SubParsersAction) -> None:
         metavar="FILE",
         type=Path,
         default=Path("camera.yaml"),
-        help="the camera file to write; default camera.yaml. A figure is drawn beside it",
+        help="the camera file to write; default camera.yaml. A figure is drawn beside it. "
+        "Files that sofjax has not written are not replaced",
     )
     parser.set_defaults(run=run)
 
@@ -72,17 +73,20 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--joint keeps the odometer's distances; leave 'distance' out of --free")
     if args.out.is_dir():
         raise InputError(f"{args.out}: is a folder; -o must name a file, such as camera.yaml")
+    figure = args.out.with_suffix(".png")
+    outputs.check_camera(args.out)
+    outputs.check_figure(figure)
     drive = begin_at(read_drive(args.drive), args.initial)
     outputs.check_writable(args.out.parent)
     found = calibrate(drive, FrontendSettings(), free, args.joint)
     print(found.summary)
-    mount_figure.draw(args.out.with_suffix(".png"), drive, found)
-    if not found.usable:
+    if found.usable:
+        write(args.out, found)
+        print(f"written to {args.out}")
+    else:
         print(f"{args.out} is not written")
-        return REFUSED
-    write(args.out, found)
-    print(f"written to {args.out}")
-    return 0
+    mount_figure.draw(figure, drive, found)
+    return 0 if found.usable else REFUSED
 
 
 def fit_before_run(drive: "Drive", settings: "FrontendSettings", folder: Path) -> "Calibration":
@@ -91,11 +95,11 @@ def fit_before_run(drive: "Drive", settings: "FrontendSettings", folder: Path) -
 
     found = calibrate(drive, settings, free_names(BY_DEFAULT))
     print(found.summary)
-    mount_figure.draw(folder / outputs.MOUNT, drive, found)
     if found.usable:
         write(folder / outputs.CAMERA, found)
     else:
         print("the drive is not run: measure the mount, or leave --calibrate out")
+    mount_figure.draw(folder / outputs.MOUNT, drive, found)
     return found
 
 

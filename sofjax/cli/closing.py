@@ -4,7 +4,6 @@ import ctypes
 import gc
 import sys
 import time
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from sofjax import loop_closure, smoothing
-from sofjax.cli import outputs
 from sofjax.cli.settings import RunSettings
 from sofjax.cli.tally import Closed, Tally
 from sofjax.evaluation import align
 from sofjax.io.drive import Drive
-from sofjax.io.trajectory import Trajectory, write_trajectory
-from sofjax.segment_map import final_map
+from sofjax.io.trajectory import Trajectory
+from sofjax.segment_map import FinalMap
 from sofjax.slam import SlamState
 
 # where a user says that the drive ends as a loop: the share of lines that must fit, and the lead
@@ -27,9 +25,13 @@ SPREAD = 0.5  # metres about its middle that a path needs to show a direction
 
 
 def close(
-    folder: Path, drive: Drive, settings: RunSettings, tally: Tally, state: SlamState
+    drive: Drive, settings: RunSettings, tally: Tally, state: SlamState, driven: FinalMap
 ) -> Closed | None:
-    """By `settings.loop`; None if there is nothing to be found."""
+    """By `settings.loop`; None if there is nothing to be found.
+
+    **Arguments:**
+    - `driven`: the map as the drive left it.
+    """
     if len(tally.stamps) < 2:
         return None
     log = jax.tree.map(lambda *leaves: np.stack(leaves), *tally.observations)
@@ -39,12 +41,11 @@ def close(
     _make_room()
     way = {"paper": _by_the_paper, "smooth": _smooth}[settings.loop]
     begun = time.perf_counter()
-    closed = way(drive, settings, tally, log, path, state)
+    closed = way(drive, settings, tally, log, path, state, driven)
     if closed is None or not np.isfinite(closed.trajectory.xy).all():
         return None
     closed = _in_the_frame_of(np.array(tally.poses, float)[:, :2], closed)
     closed.report["seconds"] = time.perf_counter() - begun
-    write_trajectory(folder / outputs.SMOOTHED, closed.trajectory)
     return closed
 
 
@@ -76,7 +77,7 @@ def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
     )
 
 
-def _smooth(drive, settings, tally, log, path, state) -> Closed:
+def _smooth(drive, settings, tally, log, path, state, _) -> Closed:
     """All poses and lines at once, and again with each loop that was found."""
     file = drive.camera_file
     closed = loop_closure.close(
@@ -109,12 +110,9 @@ def _smooth(drive, settings, tally, log, path, state) -> Closed:
     )
 
 
-def _by_the_paper(drive, settings, tally, log, path, state) -> Closed | None:
-    """The error at the end, spread evenly back along the path; nothing if no loop is found."""
+def _by_the_paper(drive, _settings, tally, _log, path, state, final) -> Closed:
+    """The error at the end, spread evenly back along the path; as it was if no loop is found."""
     mount = drive.camera_file.mount
-    final = jax.device_get(
-        eqx.filter_jit(final_map)(settings.slam.segment_map, mount, state.segment_map)
-    )
     known = loop_closure.driven(path, mount, state.segment_map, final)
     last = np.array([len(tally.stamps) - 1])
     asked = loop_closure.revisits(TOLD, known, last)

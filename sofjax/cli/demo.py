@@ -34,7 +34,9 @@ def run(args: argparse.Namespace) -> int:
     from sofjax.cli.main import main
     from sofjax.io.text import write_atomically
 
-    folder = outputs.make_folder(args.out, "demo")
+    folder = args.out or Path("runs") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"
+    outputs.check_new(folder)
+    outputs.check_writable(folder)
     drive, result = folder / "drive", folder / "run"
     steps = {
         "a robot is driven through a made-up corridor": [

@@ -38,11 +38,13 @@ def run(args: argparse.Namespace) -> int:
         )
     estimate = read_trajectory(args.folder / outputs.TRAJECTORY, "the trajectory of the run")
     errors, motion = evaluate_trajectory(truth, estimate)
-    smoothed = None
-    if (args.folder / outputs.SMOOTHED).exists():  # of which the map is a part
+    smoothed, of_the_map = None, (estimate, motion)
+    if (args.folder / outputs.SMOOTHED).exists():
         path = args.folder / outputs.SMOOTHED
         estimate = read_trajectory(path, "the smoothed trajectory of the run")
         smoothed, motion = evaluate_trajectory(truth, estimate)
+        if not _map_is_driven(args.folder):
+            of_the_map = estimate, motion
     odometry = None
     if (drive / "odometry.txt").exists():
         read = read_trajectory(drive / "odometry.txt", "the odometry").at(estimate.stamps)
@@ -50,12 +52,25 @@ def run(args: argparse.Namespace) -> int:
     of_map = None
     if true_segments is not None and (args.folder / outputs.MAP).exists():
         segments, _ = read_map(args.folder / outputs.MAP)
-        of_map = evaluate_map(true_segments, segments, motion, shared(truth, estimate).xy)
+        path, motion = of_the_map
+        of_map = evaluate_map(true_segments, segments, motion, shared(truth, path).xy)
     print(f"{args.folder} of {drive.resolve().name}: {errors.path_m:.1f} m")
     print("\n".join(errors_table(errors, smoothed, odometry, of_map)))
     if of_map is None:
         print("    the map is not compared: its file or floor_segments.csv is missing")
     return 0
+
+
+def _map_is_driven(folder: Path) -> bool:
+    """Whether the run was killed before it wrote the map that goes with its smoothed trajectory."""
+    from sofjax.cli import outputs
+
+    try:
+        of_map = json.loads((folder / outputs.REPORT).read_text(encoding="utf-8"))["map"]
+        driven = of_map["of"] == outputs.TRAJECTORY
+        return driven and of_map["sha256"] == outputs.digest(folder / outputs.MAP)
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return False
 
 
 def _drive_of(report: Path) -> Path:

@@ -43,6 +43,7 @@ def run(args: argparse.Namespace) -> int:
     drive = read_drive(args.drive)
     frontend = Frontend.of(drive)
     out = args.out or Path("runs") / f"{drive.name}-inspect.png"
+    outputs.check_figure(out)
     outputs.check_writable(out.parent)
     seen = look(drive, frontend)
     print(describe(drive, seen))

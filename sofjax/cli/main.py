@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from sofjax.cli import calibrate, demo, evaluate, inspect, run, simulate
+from sofjax.cli import calibrate, demo, evaluate, inspect, run, simulate, stopping
 from sofjax.io.errors import InputError
 
 
@@ -14,26 +14,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
     **Returns:** 0; 2 with a sentence on stderr for what the user gave and nobody can use; 130
-    after Ctrl-C; 1 if the system failed, such as by a full disk.
+    after Ctrl-C and 143 after SIGTERM, when what was done until then is written; 1 if the system
+    failed, such as by a full disk, with the file's name.
     """
-    try:
-        args = _parser().parse_args(argv)
-        _keep_compilations()
-        return args.run(args)
-    except SystemExit as end:  # argparse has printed its own
-        return end.code if isinstance(end.code, int) else 0
-    except InputError as error:
-        print(f"sofjax: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("sofjax: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:  # the reader of our output has gone
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except OSError as error:
-        print(f"sofjax: {error.filename or 'the system'}: {error.strerror}", file=sys.stderr)
-        return 1
+    with stopping.listening():
+        try:
+            args = _parser().parse_args(argv)
+            _keep_compilations()
+            return args.run(args)
+        except SystemExit as end:  # argparse has printed its own
+            return end.code if isinstance(end.code, int) else 0
+        except InputError as error:
+            print(f"sofjax: {error}", file=sys.stderr)
+            return 2
+        except KeyboardInterrupt:
+            print("sofjax: interrupted", file=sys.stderr)
+            return stopping.exit_code()
+        except BrokenPipeError:  # the reader of our output has gone
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        except OSError as error:
+            print(f"sofjax: {error.filename or 'the system'}: {error.strerror}", file=sys.stderr)
+            return 1
 
 
 def _keep_compilations() -> None:

@@ -3,7 +3,7 @@
 import platform
 import resource
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
@@ -29,7 +29,8 @@ from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 from sofjax.io.map_file import write_map
 from sofjax.io.settings import to_dict
-from sofjax.segment_map import final_map
+from sofjax.io.trajectory import write_trajectory
+from sofjax.segment_map import FinalMap, final_map
 
 UNHELD = 5.0  # metres; R, within which a line across the way is mapped and holds the distance
 FUNNEL = {  # units, and what each count of it means
@@ -41,6 +42,9 @@ FUNNEL = {  # units, and what each count of it means
     "born": "lines: begun in the map",
     "mapped": "lines: in the final map, on the floor",
 }
+# how far the run came with what is solved after the drive
+UNFINISHED = "not finished"  # stays in the report of a run that was killed
+INTERRUPTED, SOLVED, NOTHING = "interrupted", "solved", "nothing to solve"
 PACKAGES = ("sofjax", "jax", "jaxlib", "equinox", "numpy", "opencv-python-headless")
 
 
@@ -53,36 +57,56 @@ class Results:
     interrupted: bool
     warnings: list[str]
     closed: Closed | None = None
+    loop: dict[str, object] = field(default_factory=dict)  # what was asked for, how far it came
+    motion: RigidMotion | None = None  # onto the truth, where it is known
     trajectory: TrajectoryErrors | None = None
     smoothed: TrajectoryErrors | None = None  # of the path found after the drive
     odometry: TrajectoryErrors | None = None  # of the odometry alone, at the same images
     map: MapErrors | None = None
 
+    def add_loop(self, asked: str, status: str | None) -> None:
+        """What was asked for after the drive and, if anything, how far it came."""
+        self.loop = {"asked": asked} | ({"status": status} if status else {})
+        self.loop |= self.closed.report if self.closed else {}
+        if status == INTERRUPTED and not self.interrupted:
+            self.warnings.append("interrupted while solving; the map is as it was after the drive")
+
+
+def driven_map(
+    drive: Drive, settings: RunSettings, state: slam.SlamState | None
+) -> FinalMap | None:
+    """The map as the drive left it, on the host."""
+    if state is None:
+        return None
+    final = eqx.filter_jit(final_map)  # one compilation for all its small operations
+    return jax.device_get(
+        final(settings.slam.segment_map, drive.camera_file.mount, state.segment_map)
+    )
+
 
 def write_results(
     folder: Path,
     drive: Drive,
-    settings: RunSettings,
     tally: Tally,
     state: slam.SlamState | None,
+    driven: FinalMap | None,
     closed: Closed | None,
     interrupted: bool,
 ) -> Results:
-    """Write the map and the figure, and compare with the truth where it is known."""
-    found = warnings(drive, tally) + doubts.odometer(tally.odometer, settings.slam.motion)
-    if 2 * tally.step["associated"] < tally.step["below_horizon"]:
-        log = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *tally.observations)
-        found += doubts.set_up(settings.slam, drive, log)
-    results = Results(np.zeros((0, 2, 2)), 0, interrupted, found, closed)
+    """Write the map, and compare with the truth where it is known.
+
+    **Arguments:**
+    - `driven`: the map as the drive left it.
+    - `closed`: what was solved after it, if it was; then the map is of that, and its path is
+      written before it.
+    """
+    results = Results(np.zeros((0, 2, 2)), 0, interrupted, warnings(drive, tally), closed)
     seen, height = np.zeros(0, int), np.zeros(0)
+    if closed is not None:
+        write_trajectory(folder / outputs.SMOOTHED, closed.trajectory)
     if state is not None:
         if closed is None:
-            # one compilation for all its small operations
-            mount = drive.camera_file.mount
-            final = jax.device_get(
-                eqx.filter_jit(final_map)(settings.slam.segment_map, mount, state.segment_map)
-            )
-            lines = np.asarray(state.segment_map.valid).sum()
+            final, lines = driven, np.asarray(state.segment_map.valid).sum()
         else:
             final, lines = closed.final, closed.report["lines"]
         keep = final.is_floor
@@ -91,11 +115,9 @@ def write_results(
         )
         results.left_out = int(lines - keep.sum())
     write_map(folder / outputs.MAP, results.segments, seen, height)
-    motion = _compare(drive, tally, results) if tally.stamps else None
+    results.motion = _compare(drive, tally, results) if tally.stamps else None
     if not viewer.available():
         results.warnings.append(viewer.MISSING)
-    elif tally.stamps:
-        _draw(folder / outputs.FIGURE, drive, tally, results, motion)
     return results
 
 
@@ -120,11 +142,14 @@ def _compare(drive: Drive, tally: Tally, results: Results) -> RigidMotion | None
     return motion
 
 
-def _draw(
-    path: Path, drive: Drive, tally: Tally, results: Results, motion: RigidMotion | None
-) -> None:
-    """The figure in the frame of the truth if it is known, and in the map's otherwise."""
-    closed = results.closed
+def draw_figure(folder: Path, drive: Drive, tally: Tally, results: Results) -> None:
+    """The figure in the frame of the truth if it is known, and in the map's otherwise.
+
+    There is none without an image or without matplotlib.
+    """
+    if not (tally.stamps and viewer.available()):
+        return
+    closed, motion = results.closed, results.motion
     estimate = closed.trajectory if closed else tally.trajectory
     odometry = drive.odometry.at(estimate.stamps)
     turn = estimate.yaw[0] - odometry.yaw[0]
@@ -136,7 +161,7 @@ def _draw(
         e = results.smoothed or results.trajectory
         title += f", {e.ate_m:.3f} m and {e.yaw_deg:.2f}° from the true path"
     viewer.draw_map(
-        path,
+        folder / outputs.FIGURE,
         title,
         robot=to_truth.apply(estimate.xy),
         odometry=to_truth.apply(odometry),
@@ -155,9 +180,18 @@ def _ellipses(closed: Closed, to_truth: RigidMotion) -> tuple[np.ndarray, np.nda
     return to_truth.apply(closed.places[few]), covariances
 
 
+def doubts_of(drive: Drive, settings: RunSettings, tally: Tally) -> list[str]:
+    """What the images betray about the set-up."""
+    found = doubts.odometer(tally.odometer, settings.slam.motion)
+    if 2 * tally.step["associated"] < tally.step["below_horizon"]:
+        log = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *tally.observations)
+        found += doubts.set_up(settings.slam, drive, log)
+    return found
+
+
 def warnings(drive: Drive, tally: Tally) -> list[str]:
     """Sentences on what was odd about the drive."""
-    found = doubts.of_drive(drive)
+    found = doubts.of_drive(drive) + tally.doubts
     n = len(tally.stamps)
     why = ", ".join(f"{len(files)} {fault}" for fault, files in tally.faults.items())
     for count, text in (
@@ -208,7 +242,7 @@ def write_report(
         folder / outputs.REPORT,
         {
             "drive": str(drive.path.resolve()),
-            "interrupted": results.interrupted,
+            "interrupted": results.interrupted or results.loop.get("status") == INTERRUPTED,
             "seed": settings.seed,
             "settings": to_dict(settings),
             "calibration": mount,
@@ -226,6 +260,10 @@ def write_report(
                 "meaning": FUNNEL,
             },
             "left_out": results.left_out,
+            "map": {  # if the file has another digest, the run was killed on the way to its report
+                "of": outputs.SMOOTHED if results.closed else outputs.TRAJECTORY,
+                "sha256": outputs.digest(folder / outputs.MAP),
+            },
             "overflow": {"segments": tally.overflow, "map": tally.step["map_overflow"]},
             "images": {
                 "listed": len(drive.image_files),
@@ -235,7 +273,7 @@ def write_report(
                 "unreadable": tally.unreadable,
             },
             "longest_without_lines_across_m": tally.unheld,
-            "loop": {"asked": settings.loop} | (results.closed.report if results.closed else {}),
+            "loop": results.loop,
             "frames_per_second": tally.frames_per_second,
             "milliseconds_per_image": tally.milliseconds(),
             "seconds": seconds | {"first_image": sum(tally.seconds[0].values())}

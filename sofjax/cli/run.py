@@ -9,8 +9,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sofjax.cli import stopping
+
 if TYPE_CHECKING:
     from sofjax.cli.settings import RunSettings
+    from sofjax.cli.tally import Tally
     from sofjax.io.drive import Drive
     from sofjax.observation import Observation
     from sofjax.slam import SlamState, StepInfo
@@ -57,67 +60,134 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, drive, write. Ctrl-C ends the drive early, and what was done until then is written."""
+    """Read the drive, run it into a folder."""
     _drive_behind_set(args)
     begun = time.perf_counter()
-    from tqdm import tqdm
 
-    from sofjax.cli import calibrate_mount, outputs, report
+    from sofjax.cli import calibrate_mount, outputs
     from sofjax.cli.settings import gather
-    from sofjax.cli.tally import Tally
     from sofjax.io.drive import read_drive
     from sofjax.io.settings import to_dict, to_toml
     from sofjax.io.text import write_atomically
-    from sofjax.io.trajectory import TrajectoryWriter
     from sofjax.vision import Frontend
 
     settings = gather(args)
     drive = read_drive(args.drive)
     frontend = Frontend.of(drive, settings.frontend)
     drive = dataclasses.replace(drive, remarks=drive.remarks + frontend.remarks)
-    folder = outputs.make_folder(args.out, drive.name)
-    write_atomically(folder / outputs.CONFIG, to_toml(to_dict(settings)))
-    fitted = None
-    if args.calibrate:
-        fitted = calibrate_mount.fit_before_run(drive, settings.frontend, folder)
-        if not fitted.usable:
-            return calibrate_mount.REFUSED
-        drive = dataclasses.replace(drive, camera_file=fitted.camera_file)
-        frontend = Frontend(drive.camera_file, settings.frontend, bits=frontend.bits)
+    with outputs.run_folder(args.out, drive.name, drive.path) as folder:
+        write_atomically(folder / outputs.CONFIG, to_toml(to_dict(settings)))
+        mount = None
+        if args.calibrate:
+            fitted = calibrate_mount.fit_before_run(drive, settings.frontend, folder)
+            if not fitted.usable:
+                return calibrate_mount.REFUSED
+            drive = dataclasses.replace(drive, camera_file=fitted.camera_file)
+            frontend = Frontend(drive.camera_file, settings.frontend, bits=frontend.bits)
+            mount = fitted.numbers
+        return _run_into(folder, drive, frontend, settings, mount, begun)
 
-    tally, state, interrupted = Tally(), None, False
-    started = time.perf_counter()
+
+def _run_into(
+    folder: Path,
+    drive: "Drive",
+    frontend: "Frontend",
+    settings: "RunSettings",
+    mount: dict[str, object] | None,
+    begun: float,
+) -> int:
+    """Drive and write; then solve, write again, and draw.
+
+    What was driven stands on the disk before anything is solved for. Whatever ends the run, what
+    is there can be read, and the report tells how far it came. Ctrl-C ends the drive or the
+    solving, and what was done until then is written.
+
+    **Arguments:**
+    - `mount`: what `--calibrate` found, if it was asked for.
+    - `begun`: the clock when the command began.
+    """
+    from sofjax.cli import report
+    from sofjax.cli.tally import Tally
+
+    tally, seconds, closed, lapped = Tally(), {}, None, begun
+
+    def lap(name: str) -> None:
+        nonlocal lapped
+        now = time.perf_counter()
+        seconds[name], lapped = seconds.get(name, 0.0) + now - lapped, now
+
+    def write(loop: str | None) -> report.Results:
+        results = report.write_results(folder, drive, tally, state, driven, closed, bool(early))
+        results.add_loop(settings.loop, loop)
+        report.write_report(folder, drive, settings, tally, results, seconds, mount)
+        lap("write")
+        return results
+
+    lap("start")
+    with stopping.held():
+        state, early = _drive(folder, drive, frontend, settings, tally)
+        lap("drive")
+        tally.doubts = report.doubts_of(drive, settings, tally)
+        driven = report.driven_map(drive, settings, state)
+        loop = None
+        if settings.loop != "none":
+            loop = report.INTERRUPTED if early else report.UNFINISHED
+        try:
+            results = write(loop)
+        finally:
+            if isinstance(early, OSError):  # there was no room for a pose, and so for what follows
+                raise early
+        if loop == report.UNFINISHED:
+            try:
+                with stopping.allowed():
+                    from sofjax.cli.closing import close  # with optimistix, slow to import
+
+                    closed = close(drive, settings, tally, state, driven)
+                loop = report.SOLVED if closed else report.NOTHING
+            except KeyboardInterrupt:
+                loop = report.INTERRUPTED
+            lap("loop")
+            results = write(loop)
+        with stopping.allowed():
+            report.draw_figure(folder, drive, tally, results)
+        lap("write")
+        report.write_report(folder, drive, settings, tally, results, seconds, mount)
+    print(report.summary(folder, drive, tally, results, seconds))
+    return stopping.exit_code() if early or loop == report.INTERRUPTED else 0
+
+
+def _drive(
+    folder: Path, drive: "Drive", frontend: "Frontend", settings: "RunSettings", tally: "Tally"
+) -> tuple["SlamState | None", KeyboardInterrupt | OSError | None]:
+    """Take image after image, and write each one's pose.
+
+    **Returns:** the last state, and what ended the drive early: Ctrl-C or a full disk.
+    """
+    from tqdm import tqdm
+
+    from sofjax.cli import outputs
+    from sofjax.io.trajectory import TrajectoryWriter
+
+    state, coming = None, steps(settings, drive, frontend)
     bar = tqdm(total=len(drive.image_files), desc=drive.name, unit="frame", disable=None)
     with bar, TrajectoryWriter(folder / outputs.TRAJECTORY) as writer:
-        try:
-            for view, observed, info, seconds, state in steps(settings, drive, frontend):  # noqa: B007
-                tally.add(drive, view, observed, info, seconds, time.perf_counter())
+        while True:
+            try:
+                with stopping.allowed():
+                    done = next(coming, None)
+            except KeyboardInterrupt as interrupt:
+                return state, interrupt
+            if done is None:
+                return state, None
+            view, observed, info, seconds, state = done
+            tally.add(drive, view, observed, info, seconds, time.perf_counter())
+            try:
                 writer.write(tally.stamps[-1], tally.poses[-1][:2], tally.poses[-1][2])
-                bar.update()
-                if len(tally.stamps) == 1:
-                    bar.unpause()  # compiling is no part of the frames a second
-        except KeyboardInterrupt:
-            interrupted = True
-    driven = time.perf_counter()
-
-    closed = None
-    if settings.loop != "none" and state is not None and not interrupted:
-        from sofjax.cli.closing import close  # with optimistix, which takes its time to import
-
-        closed = close(folder, drive, settings, tally, state)
-    smoothed = time.perf_counter()
-    results = report.write_results(folder, drive, settings, tally, state, closed, interrupted)
-    ended = time.perf_counter()
-    seconds = {
-        "start": started - begun,
-        "drive": driven - started,
-        "loop": smoothed - driven,
-        "write": ended - smoothed,
-    }
-    mount = fitted and fitted.numbers
-    report.write_report(folder, drive, settings, tally, results, seconds, mount)
-    print(report.summary(folder, drive, tally, results, seconds))
-    return 130 if interrupted else 0
+            except OSError as error:
+                return state, error
+            bar.update()
+            if len(tally.stamps) == 1:
+                bar.unpause()  # compiling is no part of the frames a second
 
 
 def steps(

@@ -45,6 +45,7 @@ class Tally:
     detected: int = 0  # segments
     overflow: int = 0  # segments that found no place in an observation
     step: dict[str, int] = field(default_factory=lambda: dict.fromkeys(OF_THE_STEP, 0))
+    doubts: list[str] = field(default_factory=list)  # what they betray about the set-up
     seconds: list[dict[str, float]] = field(default_factory=list)  # of each stage, per image
     done: list[float] = field(default_factory=list)  # clock at the end of each image
 

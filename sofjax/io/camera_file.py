@@ -20,6 +20,10 @@ TO_FILL_IN = {  # what stands in a new file for what only the user knows
     "pitch": "fill in the radians that the camera looks down",
 }
 ROUNDING = 1e-3  # radians, by which an angle of three digits may be over its limit
+FIRST_LINE = (  # of every camera file that is written here
+    "# camera_info, with the mount of the camera on the robot: metres, radians, "
+    "pitch > 0 looks down"
+)
 
 
 @dataclass(frozen=True)
@@ -100,8 +104,7 @@ def write_intrinsics(
     comments = "".join(f"# {_printable(note)}\n" for note in notes)
     write_atomically(
         Path(path),
-        "# camera_info, with the mount of the camera on the robot: metres, radians, "
-        "pitch > 0 looks down\n"
+        f"{FIRST_LINE}\n"
         f"{comments}"
         f"image_width: {camera.width}\n"
         f"image_height: {camera.height}\n"

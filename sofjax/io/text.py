@@ -1,13 +1,17 @@
 """Reading a text file that a user named, and writing one that is never found half written."""
 
 import os
+import secrets
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from sofjax.io.errors import InputError
 
 TABLE_BYTES = 256 * 1024 * 1024  # an hour of odometry at 100 Hz has 25 MB
 SETTINGS_BYTES = 1024 * 1024
+PART = ".sofjax-part"  # ends the name of a file that is being written
 
 
 def read_text(path: Path, what: str, max_bytes: int) -> str:
@@ -37,10 +41,27 @@ def rows(path: Path, what: str) -> Iterator[tuple[int, str]]:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write beside the file, then rename: a reader sees the old text or the new, never a part."""
-    beside = path.with_name(f".{path.name}.part")
+    """Write a text file whole or not at all."""
+    with replacing(path) as file:
+        file.write(text.encode("utf-8"))
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A new file to write, which takes the place of `path` at the end of the block.
+
+    A reader sees the old content or the new, never a part. The new file has a name of its own
+    until then, so that nothing else is overwritten.
+
+    **Raises:** `OSError` that names `path`, such as for a full disk; the old file is as it was.
+    """
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
     try:
-        beside.write_text(text, encoding="utf-8")
-        os.replace(beside, path)
+        with open(part, "xb") as file:
+            yield file
+        os.replace(part, path)
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        raise
     finally:
-        beside.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)

@@ -1,8 +1,10 @@
 """Trajectories in the TUM form: one row a pose, `timestamp tx ty tz qx qy qz qw`."""
 
+import contextlib
 import itertools
 import math
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 
 import numpy as np
@@ -177,18 +179,35 @@ def _row(stamp: float, xy: np.ndarray, yaw: float) -> str:
 
 
 class TrajectoryWriter:
-    """Writes rows as they come, each one complete on the disk before the next."""
+    """Writes rows as they come, each one complete on the disk before the next.
+
+    The file is made with the first row. Where there is no room for a row, such as on a full disk,
+    the file ends with the row before, and the `OSError` names the file.
+    """
 
     def __init__(self, path: Path):
-        self._file = open(path, "w", encoding="utf-8", buffering=1)
-        self._file.write(HEAD)
+        self._path, self._size = path, 0
+        self._file: FileIO | None = None
 
     def write(self, stamp: float, xy: np.ndarray, yaw: float) -> None:
         """One pose: seconds, metres, radians."""
-        self._file.write(_row(stamp, xy, yaw))
+        row = _row(stamp, xy, yaw)
+        if self._file is None:
+            self._file, row = open(self._path, "wb", buffering=0), HEAD + row
+        left = data = row.encode()
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+        except OSError as error:
+            with contextlib.suppress(OSError):  # what is no regular file cannot be cut
+                self._file.truncate(self._size)  # a part of the row may have had room
+            error.filename = str(self._path)
+            raise
+        self._size += len(data)
 
     def close(self) -> None:
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
     def __enter__(self) -> "TrajectoryWriter":
         return self

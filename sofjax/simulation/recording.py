@@ -1,5 +1,7 @@
 """A ride drawn and written as a drive's folder, like those that a robot leaves."""
 
+import os
+import secrets
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -28,12 +30,12 @@ def record(
 
     **Raises:** `InputError` if there is such a folder with something in it already.
     """
-    path = Path(path)
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+    path = Path(path).resolve()
+    taken = path.exists() and not (path.is_dir() and not any(path.iterdir()))
+    if taken or path == Path.cwd():
         raise InputError(f"{path}: is there already; give the drive a folder of its own")
     artist = Artist(world, rig.camera_file, imaging, seed)
-    beside = path.with_name(f".{path.name}.partial")
-    shutil.rmtree(beside, ignore_errors=True)
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
         (beside / "rgb").mkdir(parents=True)
     except OSError as error:
@@ -43,9 +45,10 @@ def record(
         frames = zip(ride.truth.stamps, *ride.camera_poses(), ride.turn_rate, strict=True)
         for i, (stamp, R_world_camera, C, turn_rate) in enumerate(progress(list(frames))):
             write_image(beside / _image_name(i), artist.draw(R_world_camera, C, stamp, turn_rate))
-        if path.exists():
-            path.rmdir()
-        beside.rename(path)
+        os.rename(beside, path)  # takes the place of an empty folder, and of nothing else
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None  # the user knows no other
+        raise
     finally:
         shutil.rmtree(beside, ignore_errors=True)
 

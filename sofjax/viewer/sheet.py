@@ -2,6 +2,10 @@
 
 from pathlib import Path
 
+from sofjax.io.text import replacing
+
+SIGNATURE = b"Software\0sofjax"  # in the first bytes of every figure
+
 
 def new_figure(size: tuple[float, float], rows: int = 1, columns: int = 1):
     """A figure of its own, apart from pyplot's and the user's."""
@@ -30,12 +34,8 @@ def line_drawer(axes):
 
 
 def save(figure, path: Path) -> None:
-    """Write a PNG beside the file, then rename."""
-    beside = path.with_name(f".{path.name}.part")
-    try:
+    """Write a PNG whole or not at all; its metadata say that sofjax has written it."""
+    with replacing(path) as file:
         figure.savefig(
-            beside, dpi=150, format="png", bbox_inches="tight", metadata={"Software": "sofjax"}
+            file, dpi=150, format="png", bbox_inches="tight", metadata={"Software": "sofjax"}
         )
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
