@@ -9,6 +9,7 @@ from sofjax.io.odometry import (
     Outage,
     Speeds,
     contradictions,
+    extended,
     mend,
     unknown_motion,
     usual_speeds,
@@ -178,6 +179,24 @@ def test_what_is_not_known_of_a_motion_is_half_the_usual_speed():
     assert np.flatnonzero(jump.any(axis=1)).tolist() == [11]
     np.testing.assert_allclose(jump[11, 0], np.hypot(0.4 * 0.04, LEAST), rtol=1e-6)
     assert unknown_motion([Outage(9.0, 9.5, False, "")], speeds, stamps) is None
+
+
+def test_images_beyond_the_odometry_have_half_the_speed_of_its_end():
+    read = driven()
+    same, outages = extended("odometry.txt", read, np.array([-0.1, 4.0, 8.1]))
+    assert same is read and outages == []
+    found, (before, behind) = extended("odometry.txt", read, np.array([-1.0, 4.0, 9.96]))
+    np.testing.assert_allclose(found.stamps[[0, -1]], [-1.0, 9.96])
+    np.testing.assert_array_equal(found.xy[1:-1], read.xy)
+    first, last = steps(found)[[0, -1]]
+    np.testing.assert_allclose(np.hypot(*last[:2]), 0.5 * SPEED * 2.0, rtol=0.02)
+    np.testing.assert_allclose(last[2], 0.5 * TURN * 2.0, rtol=1e-6)
+    np.testing.assert_allclose(np.hypot(*first[:2]), 0.5 * SPEED * 1.0, rtol=0.02)
+    np.testing.assert_allclose(first[2], 0.5 * TURN * 1.0, rtol=1e-6)
+    assert (before.begin, before.end) == (-1.0, 0.0) and "no row before 0.00 s" in before.sentence
+    assert behind.end == 9.96 and not (before.bridged or behind.bridged)
+    stood = Trajectory(read.stamps, 0 * read.xy, 0 * read.yaw)
+    assert not extended("odometry.txt", stood, np.array([0.0, 20.0]))[0].xy.any()
 
 
 CONTRARY = {

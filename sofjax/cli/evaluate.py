@@ -22,9 +22,10 @@ def run(args: argparse.Namespace) -> int:
     from sofjax.cli import outputs
     from sofjax.cli.errors_table import errors_table
     from sofjax.evaluation import evaluate_map, evaluate_trajectory, shared
-    from sofjax.io.drive import check_folder, read_truth
+    from sofjax.io.drive import check_folder, read_odometry, read_truth
     from sofjax.io.errors import InputError
     from sofjax.io.map_file import read_map
+    from sofjax.io.odometry import mend
     from sofjax.io.trajectory import read_trajectory
 
     if not args.folder.is_dir():
@@ -47,8 +48,9 @@ def run(args: argparse.Namespace) -> int:
             of_the_map = estimate, motion
     odometry = None
     if (drive / "odometry.txt").exists():
-        read = read_trajectory(drive / "odometry.txt", "the odometry").at(estimate.stamps)
-        odometry, _ = evaluate_trajectory(truth, read)
+        read = read_odometry(drive / "odometry.txt")
+        mended, _ = mend("odometry.txt", read.lines, read.trajectory)
+        odometry, _ = evaluate_trajectory(truth, mended.at(estimate.stamps))
     of_map = None
     if true_segments is not None and (args.folder / outputs.MAP).exists():
         segments, _ = read_map(args.folder / outputs.MAP)

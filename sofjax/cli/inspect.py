@@ -122,8 +122,6 @@ def describe(drive: "Drive", seen: Seen) -> str:
     """The drive in a few lines for a person."""
     import numpy as np
 
-    from sofjax.io.drive import outside
-
     stamps, odometry, camera_file = drive.image_stamps, drive.odometry, drive.camera_file
     camera, mount = camera_file.camera, camera_file.mount
     K = np.asarray(camera.K, float)
@@ -132,7 +130,6 @@ def describe(drive: "Drive", seen: Seen) -> str:
         for size, f in ((camera.width, K[0, 0]), (camera.height, K[1, 1]))
     )
     turned = np.diff(odometry.yaw)
-    beyond = int(outside(odometry, stamps).sum())
     share = seen.associated / seen.below_horizon if seen.below_horizon else 0.0
     faults = seen.faults.items()
     names = {"true path (groundtruth.txt)": drive.groundtruth,
@@ -151,7 +148,7 @@ def describe(drive: "Drive", seen: Seen) -> str:
         f"{np.degrees(float(mount.pitch)):.1f}° down, {float(mount.x):.3f} m ahead of the axle",
         f"  odometry  {odometry.travelled[-1]:.1f} m, {_rate(odometry.stamps)}",
         f"            turns {np.degrees(turned[turned > 0].sum()):.0f}° left and "
-        f"{-np.degrees(turned[turned < 0].sum()):.0f}° right; {beyond} images outside its time",
+        f"{-np.degrees(turned[turned < 0].sum()):.0f}° right",
     ]
     if drive.groundtruth is not None:
         lines.append(f"  truth     {drive.groundtruth.travelled[-1]:.1f} m of path")

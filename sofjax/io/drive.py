@@ -8,7 +8,15 @@ import numpy as np
 
 from sofjax.io.camera_file import CameraFile, read_camera
 from sofjax.io.errors import InputError
-from sofjax.io.odometry import Outage, contradictions, mend, unknown_motion, usual_speeds
+from sofjax.io.odometry import (
+    CLOSE,
+    Outage,
+    contradictions,
+    extended,
+    mend,
+    unknown_motion,
+    usual_speeds,
+)
 from sofjax.io.text import rows
 from sofjax.io.trajectory import (
     Trajectory,
@@ -22,7 +30,6 @@ from sofjax.io.trajectory import (
 MANY = 8  # warnings of one kind
 MAX_IMAGES = 300_000  # more than eight hours at 10 Hz
 MAX_NAME = 1000  # characters of an image's path
-CLOSE = 0.2  # seconds that the odometry may start late or end early without a word
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,7 @@ def read_drive(path: Path) -> Drive:
     path = check_folder(path)
     camera_file = read_camera(path / "camera.yaml")
     stamps, files, nanoseconds, remarks = _read_images(path)
-    read = _read_odometry(path / "odometry.txt")
+    read = read_odometry(path / "odometry.txt")
     truth = _read_true_path(path)
     counted = {"rgb.txt": nanoseconds, "odometry.txt": read.nanoseconds}
     remarks += read.remarks
@@ -66,7 +73,8 @@ def read_drive(path: Path) -> Drive:
             f"{path}: the images ({stamps[0]:.3f} to {stamps[-1]:.3f} s) and the odometry "
             f"({span}) never meet; both need the timestamps of one clock, in seconds"
         )
-    odometry, outages = mend("odometry.txt", read.lines, read.trajectory)
+    mended, outages = mend("odometry.txt", read.lines, read.trajectory)
+    odometry, beyond = extended("odometry.txt", mended, stamps)
     return Drive(
         path=path,
         name=path.resolve().name,
@@ -74,8 +82,8 @@ def read_drive(path: Path) -> Drive:
         image_stamps=stamps,
         image_files=files,
         odometry=odometry,
-        outages=outages + _without_odometry(odometry, stamps),
-        contradictions=contradictions("odometry.txt", read.lines, read.trajectory, odometry),
+        outages=outages + beyond,
+        contradictions=contradictions("odometry.txt", read.lines, read.trajectory, mended),
         remarks=remarks,
         groundtruth=truth and truth.trajectory,
         floor_segments=_read_true_segments(path),
@@ -137,8 +145,8 @@ def read_floor_segments(path: Path) -> np.ndarray:
 def motions(drive: Drive) -> np.ndarray:
     """The odometer's motion up to each image, T_previous_current as (dx, dy, dyaw); [T, 3].
 
-    The odometry is interpolated at the stamps of the images. The first motion is the identity,
-    and so is one between two images that both lie outside the odometry's span.
+    The odometry is interpolated at the stamps of the images. The first motion is the identity, and
+    so is one between two images beyond the ends of the odometry.
     """
     at = drive.odometry.at(drive.image_stamps)
     dx, dy = np.diff(at.xy, axis=0).T
@@ -175,20 +183,8 @@ def outside(odometry: Trajectory, stamps: np.ndarray) -> np.ndarray:
     return (stamps < odometry.stamps[0] - CLOSE) | (stamps > odometry.stamps[-1] + CLOSE)
 
 
-def _without_odometry(odometry: Trajectory, stamps: np.ndarray) -> list[Outage]:
-    """The times before and behind the odometry in which there are images."""
-    begin, end = (float(t) for t in odometry.stamps[[0, -1]])
-    found = []
-    if stamps[0] < begin - CLOSE:
-        told = f"odometry.txt: no row before {begin:.2f} s"
-        found.append(Outage(float(stamps[0]), begin, False, told))
-    if stamps[-1] > end + CLOSE:
-        told = f"odometry.txt: no row after {end:.2f} s"
-        found.append(Outage(end, float(stamps[-1]), False, told))
-    return found
-
-
-def _read_odometry(path: Path) -> TrajectoryFile:
+def read_odometry(path: Path) -> TrajectoryFile:
+    """The odometry as it stands in its file, of two poses or more; `mend` makes it a path."""
     if not path.exists():
         raise InputError(
             f"{path}: the wheel odometry is missing, and without it neither the motion nor the "

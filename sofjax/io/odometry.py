@@ -11,6 +11,8 @@ import numpy as np
 
 from sofjax.io.trajectory import Trajectory
 
+CLOSE = 0.2  # seconds that it may begin late or end early without a word
+NEAR = 3  # steps on either side that tell a speed
 MIN_ROWS = 8  # below which there is no usual speed
 USUAL = 0.8  # quantile of the speeds of a robot that moves
 MOVING = 0.02  # metres and radians a second, above which it does
@@ -91,6 +93,46 @@ def mend(where: str, lines: np.ndarray, read: Trajectory) -> tuple[Trajectory, l
             what = f"no row for {dt[i]:.2f} s from {begin:.2f} s on"
         outages.append(Outage(begin, end, not jump[i], f"{at}: {what}"))
     return (_without(mended, jump) if jump.any() else mended), outages
+
+
+def extended(
+    where: str, odometry: Trajectory, stamps: np.ndarray
+) -> tuple[Trajectory, list[Outage]]:
+    """The odometry with poses for the images that lie beyond its ends, and the time without it.
+
+    There the robot may have driven on or stood: half of its speed at the end lies between.
+
+    **Arguments:**
+    - `where`: the file, for the sentences.
+    - `stamps`: [T] of the images, seconds.
+    """
+    begin, end = float(odometry.stamps[0]), float(odometry.stamps[-1])
+    twist = _steps_robot(odometry) / np.diff(odometry.stamps)[:, None]
+    outages = []
+    if stamps[0] < begin - CLOSE:
+        outages.append(
+            Outage(float(stamps[0]), begin, False, f"{where}: no row before {begin:.2f} s")
+        )
+        at = (stamps[0] - begin) * np.median(twist[:NEAR], axis=0) / 2
+        odometry = _with_pose(odometry, 0, stamps[0], at)
+    if stamps[-1] > end + CLOSE:
+        outages.append(Outage(end, float(stamps[-1]), False, f"{where}: no row after {end:.2f} s"))
+        at = (stamps[-1] - end) * np.median(twist[-NEAR:], axis=0) / 2
+        odometry = _with_pose(odometry, len(odometry.stamps), stamps[-1], at)
+    return odometry, outages
+
+
+def _with_pose(odometry: Trajectory, i: int, stamp: float, twist: np.ndarray) -> Trajectory:
+    """One pose more, before or behind, a motion away from the first or the last."""
+    last = min(i, len(odometry.stamps) - 1)
+    yaw = odometry.yaw[last]
+    along = _chord(twist) * np.exp(1j * yaw)
+    xy = odometry.xy[last] + [along.real, along.imag]
+    return Trajectory(
+        np.insert(odometry.stamps, i, stamp),
+        np.insert(odometry.xy, i, xy, axis=0),
+        np.insert(odometry.yaw, i, yaw + twist[2]),
+    )
 
 
 def usual_speeds(trajectory: Trajectory) -> Speeds:
@@ -222,22 +264,31 @@ def _restarts(trajectory: Trajectory) -> np.ndarray:
 
 def _without(trajectory: Trajectory, jump: np.ndarray) -> Trajectory:
     """The path with the steps marked replaced by the speed of those around them."""
-    dt = np.diff(trajectory.stamps)
-    c, s = np.cos(trajectory.yaw[:-1]), np.sin(trajectory.yaw[:-1])
-    dx, dy = np.diff(trajectory.xy, axis=0).T
-    steps = np.stack([c * dx + s * dy, c * dy - s * dx, np.diff(trajectory.yaw)], axis=1)
+    dt, steps = np.diff(trajectory.stamps), _steps_robot(trajectory)
     known = np.flatnonzero(~jump)
     for i in np.flatnonzero(jump):
-        near = known[np.abs(known - i) <= 3]
+        near = known[np.abs(known - i) <= NEAR]
         usual = np.median(steps[near] / dt[near, None], axis=0) if len(near) else np.zeros(3)
-        x, y, turn = usual * dt[i]
-        along = (x + 1j * y) * np.exp(0.5j * turn) * np.sinc(turn / (2 * np.pi))  # the arc's chord
-        steps[i] = along.real, along.imag, turn
+        along = _chord(usual * dt[i])
+        steps[i] = along.real, along.imag, usual[2] * dt[i]
     yaw = trajectory.yaw[0] + np.append(0.0, np.cumsum(steps[:, 2]))
     c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
     moved = np.stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]], axis=1)
     xy = trajectory.xy[0] + np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
     return Trajectory(trajectory.stamps, xy, yaw)
+
+
+def _steps_robot(trajectory: Trajectory) -> np.ndarray:
+    """[n - 1, 3] forward, to the left (metres) and turn (radians), in the frame of each row."""
+    c, s = np.cos(trajectory.yaw[:-1]), np.sin(trajectory.yaw[:-1])
+    dx, dy = np.diff(trajectory.xy, axis=0).T
+    return np.stack([c * dx + s * dy, c * dy - s * dx, np.diff(trajectory.yaw)], axis=1)
+
+
+def _chord(twist: np.ndarray) -> complex:
+    """Where an arc [3] (metres, metres, radians) ends, forward + i left."""
+    x, y, turn = twist.tolist()
+    return (x + 1j * y) * np.exp(0.5j * turn) * np.sinc(turn / (2 * np.pi))
 
 
 def _direction_of_travel(trajectory: Trajectory) -> tuple[float | None, float]:
