@@ -132,7 +132,8 @@ def test_an_odometry_that_is_spoilt_is_told_and_survived(drive, log, fault):
     told = odometry_warnings(read)
     assert (sentence is None and told == []) or (len(told) == 1 and sentence in told[0])
     metres, degrees = errors_of(read, log)
-    assert metres < 0.02 and degrees < (1.0 if change is late else 0.3)
+    unread = change in (cut, late)  # for two seconds, and nothing behind or before it
+    assert metres < (0.05 if unread else 0.02) and degrees < (1.0 if unread else 0.3)
 
 
 def test_a_hole_in_the_images_is_no_error_of_the_estimate(drive, log):
