@@ -14,6 +14,7 @@ from sofjax.io.trajectory import Trajectory, gaps
 SLACK = 0.06  # seconds that a true pose may lie beyond the estimate's ends
 NEAR_IN_TIME = 0.75  # of the usual time between estimates, from one of them; in a gap of theirs
 SPACING = 0.02  # metres between the samples of a map
+SAMPLES = 1_000_000  # of a map at most: 20 km of lines
 NEAR = 0.05  # metres from a true line within which a sample is right ...
 PARALLEL = np.deg2rad(5)  # ... if its direction is this near too
 IN_SIGHT = 3.0  # metres from the path within which a true line counts as seen
@@ -143,25 +144,32 @@ def evaluate_map(
     - `path`: [n, 2], true positions of the robot, metres: what it drove past.
     """
     segments = motion.apply(segments)
-    points, angles = sample(segments)
+    spacing = max(_spacing(segments), _spacing(truth))
+    points, angles = sample(segments, spacing)
     distance = distance_to_segments(points, angles, truth)
     right = distance <= NEAR
-    true_points, true_angles = (values[::5] for values in sample(truth))
+    true_points, true_angles = (values[::5] for values in sample(truth, spacing))
     seen = distance_to_points(true_points, path) < IN_SIGHT
     found = distance_to_segments(true_points, true_angles, segments) <= NEAR
     return MapErrors(
         segments=len(segments),
-        length_m=float(len(points) * SPACING),
+        length_m=float(len(points) * spacing),
         precision=float(right.mean()) if len(right) else 0.0,
         recall=float(found[seen].mean()) if seen.any() else 0.0,
         error_m=float(np.median(distance[right])) if right.any() else float("nan"),
     )
 
 
-def sample(segments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _spacing(segments: np.ndarray) -> float:
+    """Metres between samples: 2 cm, and more where there would be too many."""
+    length = float(np.hypot(*(segments[:, 1] - segments[:, 0]).T).sum())
+    return max(SPACING, length / SAMPLES)
+
+
+def sample(segments: np.ndarray, spacing: float = SPACING) -> tuple[np.ndarray, np.ndarray]:
     """Points [P, 2] every 2 cm of the segments [K, 2, 2], and the directions [P] there, radians."""
     d = segments[:, 1] - segments[:, 0]
-    counts = np.maximum(2, (np.hypot(*d.T) / SPACING).astype(int))
+    counts = np.maximum(2, (np.hypot(*d.T) / spacing).astype(int))
     owner = np.repeat(np.arange(len(segments)), counts)
     first = np.repeat(np.cumsum(counts) - counts, counts)
     share = (np.arange(len(owner)) - first + 0.5) / counts[owner]

@@ -78,10 +78,10 @@ def _map_is_driven(folder: Path) -> bool:
 def _drive_of(report: Path) -> Path:
     """The drive that a report names."""
     from sofjax.io.errors import InputError
-    from sofjax.io.text import TABLE_BYTES, read_text
+    from sofjax.io.text import DOCUMENT_BYTES, read_text
 
     try:
-        return Path(json.loads(read_text(report, "the report of the run", TABLE_BYTES))["drive"])
+        return Path(json.loads(read_text(report, "the report of the run", DOCUMENT_BYTES))["drive"])
     except InputError as error:
         raise InputError(f"{error}; name the drive as a second argument") from None
     except (ValueError, LookupError, TypeError, RecursionError):

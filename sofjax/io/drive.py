@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from sofjax.io.camera_file import CameraFile, read_camera
-from sofjax.io.errors import InputError
+from sofjax.io.errors import InputError, quoted
+from sofjax.io.map_file import check_length
 from sofjax.io.odometry import (
     CLOSE,
     Outage,
@@ -136,7 +137,9 @@ def read_floor_segments(path: Path) -> np.ndarray:
             raise InputError(
                 f"{path}, line {number}: {len(words)} columns where there must be x1,y1,x2,y2,kind"
             )
-        table.append([finite(f"{path}, line {number}", word) for word in words[:4]])
+        where = f"{path}, line {number}"
+        table.append([finite(where, word.strip()) for word in words[:4]])
+        check_length(where, np.reshape(table[-1], (1, 2, 2)))
     if not table:
         raise InputError(f"{path}: no segment in it; without truth there must be no such file")
     return np.array(table).reshape(-1, 2, 2)
@@ -212,20 +215,21 @@ def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
         names.append(words[1])
     if not names:
         raise InputError(f"{table}: no image in it; there must be a row 'timestamp file' for each")
-    kept, remarks = in_order(table, numbers, stamps, names)
+    at, files = np.array(stamps), np.array(names, object)
+    kept, remarks = in_order(table, np.array(numbers), at, files[:, None])
+    at, files = at[kept], files[kept].tolist()
     folder = _Folder(path)
-    there = [folder.has(f"{at_line}{numbers[i]}", names[i]) for i in kept]
+    lines = np.array(numbers)[kept].tolist()
+    there = [folder.has(f"{at_line}{n}", file) for n, file in zip(lines, files, strict=True)]
     if 2 * sum(there) < len(there):
         raise InputError(
             f"{table}: {len(there) - sum(there)} of its {len(there)} images are missing, "
-            f"{path / names[kept[there.index(False)]]} first; the files must lie where the list "
-            "says"
+            f"{path / files[there.index(False)]} first; the files must lie where the list says"
         )
-    at = np.array(stamps)[kept]
     nanoseconds = in_nanoseconds(at)
     if nanoseconds:
         at = 1e-9 * at
-    return at, [path / names[i] for i in kept], nanoseconds, remarks
+    return at, [path / file for file in files], nanoseconds, remarks
 
 
 class _Folder:
@@ -241,11 +245,12 @@ class _Folder:
         odd = len(name) > MAX_NAME or "\0" in name or name.startswith("/")
         if odd or (".." in name and ".." in name.split("/")):
             right = "must be a path inside the drive's folder"
-            raise InputError(f"{where}: the image {name!r:.120} {right}")
+            raise InputError(f"{where}: the image {quoted(name)} {right}")
         parent, _, base = name.rpartition("/")
         if parent not in self._inside:
-            self._check_link(where, parent)
             self._inside[parent] = self._entries(parent)
+            if self._inside[parent]:
+                self._check_link(where, parent)
         entry = self._inside[parent].get(base)
         if entry is not None and entry.is_symlink():
             self._check_link(where, name)
@@ -265,5 +270,5 @@ class _Folder:
             inside = False
         if not inside:
             raise InputError(
-                f"{where}: {name!r:.120} is a link that leads out of the drive's folder"
+                f"{where}: {quoted(name)} is a link that leads out of the drive's folder"
             )

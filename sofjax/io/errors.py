@@ -3,15 +3,31 @@
 import difflib
 from collections.abc import Iterable
 
+QUOTED = 100  # characters of what a user gave that a message quotes
+
 
 class InputError(ValueError):
     """One sentence for the user: where it is, what is wrong, and what would be right."""
 
 
+def quoted(value: object) -> str:
+    """What a user gave as a message quotes it: on one line, and of a long text its beginning."""
+    if not isinstance(value, str):
+        value = repr(value)
+        return value if len(value) <= QUOTED else f"{value[:QUOTED]}..."
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in value[: QUOTED + 1])
+    return f"'{text}'" if len(text) <= QUOTED else f"'{text[:QUOTED]}...'"
+
+
+def plain(error: Exception | str) -> str:
+    """What another library says of an error, on one line of a message."""
+    return quoted(str(error) or type(error).__name__)[1:-1]
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """A hint at the known name that a misspelt one was meant to be."""
     known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(name[:QUOTED], known, n=1, cutoff=0.5)
     if close:
         return f"did you mean '{close[0]}'?"
     return f"known are {', '.join(known)}"

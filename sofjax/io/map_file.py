@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sofjax.io.errors import InputError
-from sofjax.io.text import TABLE_BYTES, read_text, write_atomically
+from sofjax.io.errors import InputError, quoted
+from sofjax.io.text import DOCUMENT_BYTES, read_text, write_atomically
+
+LONGEST = 10_000.0  # metres of a segment
 
 
 def write_map(
@@ -38,7 +40,7 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
     A line of several points is as many segments; features that are no LineString are passed over.
     """
     try:
-        document = json.loads(read_text(path, "the map", TABLE_BYTES))
+        document = json.loads(read_text(path, "the map", DOCUMENT_BYTES))
         features = document["features"]
         segments, seen = [], []
         for feature in features:
@@ -47,7 +49,8 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
             points = np.array([p[:2] for p in feature["geometry"]["coordinates"]], float)
             points = points.reshape(-1, 2)
             segments += list(np.stack([points[:-1], points[1:]], axis=1))
-            seen += [int((feature.get("properties") or {}).get("seen", 0))] * (len(points) - 1)
+            count = (feature.get("properties") or {}).get("seen", 0)
+            seen += [_count(path, count)] * (len(points) - 1)
         endpoints = np.array(segments, float).reshape(-1, 2, 2)
     except InputError:
         raise
@@ -59,4 +62,21 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ) from None
     if not np.isfinite(endpoints).all():
         raise InputError(f"{path}: a coordinate is not finite")
+    check_length(f"{path}", endpoints)
     return endpoints, np.array(seen, int)
+
+
+def check_length(where: str, endpoints: np.ndarray) -> None:
+    """Refuse segments [K, 2, 2] that are no line on a floor."""
+    length = np.abs(endpoints[:, 1] - endpoints[:, 0]).max(axis=1, initial=0)
+    if (length > LONGEST).any():
+        raise InputError(
+            f"{where}: a segment of {length.max():.3g} m; it must be in metres, of at most "
+            f"{LONGEST:g}"
+        )
+
+
+def _count(path: Path, value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**31:
+        raise InputError(f"{path}: 'seen' is {quoted(value)}; it must be a whole number of images")
+    return value

@@ -6,19 +6,20 @@ A field with `INLINE` as its metadata lends its own fields to the level above.
 
 import dataclasses
 import json
-import math
+import sys
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sofjax.io.errors import InputError, nearest
+from sofjax.io.errors import InputError, nearest, plain, quoted
 from sofjax.io.text import SETTINGS_BYTES, read_text
 
 Config = TypeVar("Config")
 Setting = bool | int | float | str
 
 INLINE = {"inline": True}
+DOTS = 100  # in a line
 
 
 def to_dict(config: Any) -> dict[str, Setting]:
@@ -37,7 +38,7 @@ def with_settings(config: Config, given: Mapping[str, object], where: str) -> Co
     values = {}
     for name, value in given.items():
         if name not in known:
-            raise InputError(f"{where}: there is no setting '{name}'; {nearest(name, known)}")
+            raise InputError(f"{where}: there is no setting {quoted(name)}; {nearest(name, known)}")
         values[name] = _cast(f"{where}: '{name}'", value, known[name])
     try:
         return _replace(config, values, "")
@@ -50,13 +51,14 @@ def with_settings(config: Config, given: Mapping[str, object], where: str) -> Co
 def read_toml(path: Path) -> dict[str, object]:
     """The settings of a TOML file by their names; tables become the dots."""
     path = Path(path)
+    text = read_text(path, "the settings file", SETTINGS_BYTES)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.count(".") > DOTS:  # a key of many takes the square of their number
+            raise InputError(f"{path}, line {number}: {line.count('.')} dots, in no setting's name")
     try:
-        table = tomllib.loads(read_text(path, "the settings file", SETTINGS_BYTES))
+        return dict(_flatten(tomllib.loads(text), ""))
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: not TOML: {str(error) or type(error).__name__}") from None
-    return dict(_flatten(table, ""))
+        raise InputError(f"{path}: not TOML: {plain(error)}") from None
 
 
 def to_toml(settings: Mapping[str, Setting]) -> str:
@@ -115,14 +117,14 @@ def _cast(where: str, value: object, like: Setting) -> Setting:
         right = "a whole number"
     elif isinstance(like, float):
         if (text and _parses(float, value)) or type(value) in (int, float):
-            if math.isfinite(float(value)):
+            if abs(float(value) if text else value) <= sys.float_info.max:
                 return float(value)
         right = "a finite number"
     else:
         if text:
             return value
         right = "text"
-    raise InputError(f"{where} is {value!r:.60}; it must be {right}")
+    raise InputError(f"{where} is {quoted(value)}; it must be {right}")
 
 
 def _parses(kind: type, text: str) -> bool:

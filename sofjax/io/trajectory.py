@@ -1,20 +1,23 @@
 """Trajectories in the TUM form: one row a pose, `timestamp tx ty tz qx qy qz qw`."""
 
 import contextlib
-import itertools
 import math
+import re
+from array import array
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
 
 import numpy as np
 
-from sofjax.io.errors import InputError
+from sofjax.io.errors import InputError, quoted
 from sofjax.io.text import rows, write_atomically
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 HEAD = f"# T_world_robot: {COLUMNS}\n"
 GAP = 2.5  # times the usual time from stamp to stamp, beyond which some are missing
+NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+LARGEST = 1e20  # nanoseconds of an epoch have 19 digits
 MANY = 12  # lines that a sentence names
 
 
@@ -63,63 +66,60 @@ def read_trajectory_file(path: Path, what: str) -> TrajectoryFile:
     **Raises:** `InputError` that names the line for anything but rows of 8 finite numbers with
     increasing stamps, unit quaternions and the z axis up.
     """
-    numbers, table = [], []
+    numbers, flat = array("q"), array("d")
     for number, line in rows(path, what):
-        table.append(_pose(f"{path}, line {number}", line))
+        flat.extend(_pose(f"{path}, line {number}", line))
         numbers.append(number)
-    if not table:
+    if not numbers:
         raise InputError(f"{path}: no pose in it; {what} has a row '{COLUMNS}' for each pose")
-    kept, remarks = in_order(path, numbers, [row[0] for row in table], [row[1:] for row in table])
-    stamps, x, y, _, qx, qy, qz, qw = np.array([table[i] for i in kept]).T
+    lines, table = np.array(numbers), np.array(flat).reshape(-1, 8)
+    kept, remarks = in_order(path, lines, table[:, 0], table[:, 1:])
+    stamps, x, y, _, qx, qy, qz, qw = table[kept].T
     nanoseconds = in_nanoseconds(stamps)
     if nanoseconds:
         stamps = 1e-9 * stamps
     yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
     trajectory = Trajectory(stamps, np.stack([x, y], axis=-1), np.unwrap(yaw))
-    return TrajectoryFile(trajectory, np.array(numbers)[kept], nanoseconds, remarks)
+    return TrajectoryFile(trajectory, lines[kept], nanoseconds, remarks)
 
 
 def in_order(
-    path: Path, numbers: list[int], stamps: list[float], values: list
-) -> tuple[list[int], list[str]]:
+    path: Path, lines: np.ndarray, stamps: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, list[str]]:
     """Which rows to keep: of several with one stamp and one value the first.
 
     **Arguments:**
-    - `numbers`: the line of each row.
-    - `values`: what each row says of its stamp.
+    - `lines`: [n], the line of each row.
+    - `stamps`: [n].
+    - `values`: [n, k], what each row says of its stamp.
 
-    **Returns:** their indices, and remarks on what was dropped.
+    **Returns:** [n] bool, and remarks on what was dropped.
 
     **Raises:** `InputError` with all lines that say different things of one stamp, or with the
     line whose stamp runs back.
     """
-    first: dict[float, int] = {}
-    kept, dropped, torn = [], [], []
-    for i, stamp in enumerate(stamps):
-        before = first.setdefault(stamp, i)
-        if before == i:
-            kept.append(i)
-        elif values[i] == values[before]:
-            dropped.append(numbers[i])
-        else:
-            torn += [numbers[before], numbers[i]]
-    if torn:
-        torn = sorted(set(torn))
-        few = ", ".join(map(str, torn[:MANY])) + f" and {len(torn) - MANY} more" * (
-            len(torn) > MANY
-        )
+    _, first, which = np.unique(stamps, return_index=True, return_inverse=True)
+    before = first[which]  # the first row of the same stamp
+    kept = before == np.arange(len(stamps))
+    torn = ~kept & (values != values[before]).any(axis=1)
+    if torn.any():
+        several = np.unique(lines[np.append(np.flatnonzero(torn), before[torn])])
+        few = ", ".join(map(str, several[:MANY]))
+        few += f" and {len(several) - MANY} more" * (len(several) > MANY)
         raise InputError(
             f"{path}, lines {few}: a timestamp repeats with another value; each must stand there "
             "once"
         )
-    for before, after in itertools.pairwise(kept):
-        if stamps[after] < stamps[before]:
-            raise InputError(
-                f"{path}, line {numbers[after]}: the timestamp {stamps[after]:.6f} runs back "
-                f"behind {stamps[before]:.6f} of the row before; timestamps must increase"
-            )
-    remark = f"{path.name}: {len(dropped)} rows repeat another and were dropped"
-    return kept, [f"{remark}, line {dropped[0]} first"] if dropped else []
+    times, at = stamps[kept], lines[kept]
+    for i in np.flatnonzero(np.diff(times) < 0)[:1]:
+        raise InputError(
+            f"{path}, line {at[i + 1]}: the timestamp {times[i + 1]:.6f} runs back "
+            f"behind {times[i]:.6f} of the row before; timestamps must increase"
+        )
+    if kept.all():
+        return kept, []
+    remark = f"{path.name}: {(~kept).sum()} rows repeat another and were dropped"
+    return kept, [f"{remark}, line {lines[~kept][0]} first"]
 
 
 def gaps(stamps: np.ndarray) -> list[tuple[float, float]]:
@@ -157,13 +157,13 @@ def _pose(where: str, line: str) -> list[float]:
 
 
 def finite(where: str, word: str) -> float:
-    """A number of a table, or the sentence that says why it is none."""
-    try:
-        value = float(word)
-    except ValueError:
-        raise InputError(f"{where}: '{word[:40]}' is not a number") from None
-    if not math.isfinite(value):
-        raise InputError(f"{where}: '{word}' is not a finite number")
+    """A plain decimal number of a table, or the sentence that says why it is none."""
+    if not NUMBER.fullmatch(word):
+        known = word.lower().lstrip("+-") in ("nan", "inf", "infinity")
+        raise InputError(f"{where}: {quoted(word)} is not a {'finite ' * known}number")
+    value = float(word)
+    if not abs(value) <= LARGEST:
+        raise InputError(f"{where}: {quoted(word)} is not a finite number")
     return value
 
 

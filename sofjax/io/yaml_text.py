@@ -1,16 +1,24 @@
 """YAML that cannot run code, nor unfold without end."""
 
+import re
+from typing import ClassVar
+
 import yaml
 
-from sofjax.io.errors import InputError
+from sofjax.io.errors import InputError, plain, quoted
 
 MAX_DEPTH = 20
+OPENCV = "tag:yaml.org,2002:opencv-matrix"
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain data alone: no tags that build objects, no aliases, no name given twice."""
+    """Plain data alone: no tags, no aliases, no name given twice.
+
+    Numbers are decimal: in YAML 1.1 5:20 is 320, 017 is 15 and `no` is false.
+    """
 
     depth = 0
+    yaml_implicit_resolvers: ClassVar[dict] = {}  # none of YAML 1.1; those below
 
     def compose_node(self, parent, index):
         if self.check_event(yaml.AliasEvent) or self.peek_event().anchor is not None:
@@ -18,6 +26,12 @@ class _Loader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(
                 problem="anchors (&) and aliases (*) are not allowed; write the value out",
                 problem_mark=mark,
+            )
+        event = self.peek_event()
+        tag = getattr(event, "tag", None)
+        if tag not in (None, "!", OPENCV):
+            raise yaml.MarkedYAMLError(
+                problem=f"the tag {quoted(tag)} is not allowed", problem_mark=event.start_mark
             )
         self.depth += 1
         if self.depth > MAX_DEPTH:
@@ -35,7 +49,15 @@ class _Loader(yaml.SafeLoader):
         return mapping
 
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_yaml_map)
+_Loader.add_constructor(OPENCV, _Loader.construct_yaml_map)
+for _kind, _form in {
+    "null": r"~|null|Null|NULL|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?(0|[1-9][0-9]*)",
+    "float": r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?[0-9]+[eE][-+]?[0-9]+"
+    r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+}.items():
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(f"({_form})$"), None)
 
 
 def parse_yaml(text: str, where: str) -> object:
@@ -51,10 +73,9 @@ def parse_yaml(text: str, where: str) -> object:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""
-        raise InputError(f"{where}{line}: not plain YAML: {error.problem}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{where}: not plain YAML: {first}") from None
+        raise InputError(f"{where}{line}: not plain YAML: {plain(error.problem)}") from None
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        raise InputError(f"{where}: not plain YAML: {plain(error)}") from None
     documents = [data for data in documents if data is not None]
     if len(documents) > 1 and all(isinstance(data, dict) for data in documents):
         joined = {key: value for data in documents for key, value in data.items()}

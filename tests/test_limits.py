@@ -1,0 +1,117 @@
+"""Files that are small, or look it, and unfold: a sentence within seconds and a bounded memory.
+
+Each is read in a process of its own, without the checks of types that the tests add to every call.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+OFFICE = Path(__file__).parent.parent / "examples" / "office"
+SECONDS, MEBIBYTES = 3, 300
+
+READERS = {
+    "drive": "from sofjax.io.drive import read_drive as read",
+    "map": "from sofjax.io.map_file import read_map as read",
+    "settings": "from sofjax.io.settings import read_toml as read",
+    "camera": "from sofjax.io.camera_file import read_camera as read",
+}
+
+
+def read(kind, path):
+    """Seconds and MiB that it took to refuse a file, and the sentence."""
+    code = f"""
+import json, resource, sys, time
+{READERS[kind]}
+from sofjax.io.errors import InputError
+memory = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+before, begun = memory(), time.process_time()
+try:
+    read(sys.argv[1])
+except InputError as error:
+    print(json.dumps([time.process_time() - begun, memory() - before, str(error)]))
+"""
+    command = [sys.executable, "-c", code, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+@pytest.fixture
+def drive(tmp_path):
+    for name in ("camera.yaml", "odometry.txt"):
+        shutil.copy(OFFICE / name, tmp_path)
+    shutil.copy(OFFICE / "rgb" / "000000.jpg", tmp_path)
+    (tmp_path / "rgb.txt").write_text("0.0 000000.jpg\n")
+    return tmp_path
+
+
+TABLES = {
+    "a million images": ("rgb.txt", "".join(f"{i} rgb/{i}.jpg\n" for i in range(10**6))),
+    "missing images": ("rgb.txt", "".join(f"{i} rgb/{i}.jpg\n" for i in range(250_000))),
+    "a million folders": ("rgb.txt", "0 " + "a/" * 10**6 + "b.jpg\n"),
+    "a folder each": ("rgb.txt", "".join(f"{i} {i}/a.jpg\n" for i in range(100_000))),
+    "blank lines": ("odometry.txt", "\n" * 200_000_000),
+    "a line without end": ("odometry.txt", "# " + "x" * 200_000_000),
+    "numbers without end": ("odometry.txt", "1 " * 20_000_000),
+    "too many bytes": ("odometry.txt", "#\n" * 150_000_000),
+}
+
+
+@pytest.mark.parametrize("bomb", TABLES)
+def test_a_table_that_unfolds(drive, bomb):
+    name, text = TABLES[bomb]
+    (drive / name).write_text(text)
+    seconds, mebibytes, sentence = read("drive", drive)
+    assert name in sentence and len(sentence) < 400
+    assert seconds < SECONDS and mebibytes < MEBIBYTES
+
+
+DOCUMENTS = {
+    "dots": ("settings", "a" + ".a" * 300_000 + " = 1"),
+    "dots of a table": ("settings", "[a" + ".a" * 300_000 + "]"),
+    "a long name": ("settings", "a" * 500_000),
+    "deep lists": ("settings", "a = " + "[" * 100_000),
+    "a number of many digits": ("settings", "a = " + "9" * 900_000),
+    "deep JSON": ("map", "[" * 1_000_000),
+    "a long word": ("map", '"' + "a" * 10_000_000),
+    "empty features": ("map", '{"features": [' + ",".join(["{}"] * 3_000_000) + "]}"),
+    "a number of seen": ("map", '{"features": [{"seen": ' + "9" * 5_000_000 + "}]}"),
+    "colons": ("camera", "image_width: " + "1:" * 2500 + "1"),
+    "digits": ("camera", "image_width: " + "1" * 900_000),
+    "braces": ("camera", "{" * 900_000),
+    "words": ("camera", "- a\n" * 10_000),
+}
+
+
+@pytest.mark.parametrize("bomb", DOCUMENTS)
+def test_a_document_that_unfolds(tmp_path, bomb):
+    kind, text = DOCUMENTS[bomb]
+    (tmp_path / "file").write_text(text)
+    seconds, mebibytes, sentence = read(kind, tmp_path / "file")
+    assert "file" in sentence and len(sentence) < 400 and "\n" not in sentence
+    assert seconds < SECONDS and mebibytes < MEBIBYTES
+
+
+@pytest.mark.parametrize("where", ["truth", "map"])
+def test_a_comparison_of_long_lines_has_no_more_memory(where):
+    """A thousand lines of ten kilometres."""
+    code = """
+import resource, sys
+import numpy as np
+from sofjax.evaluation import RigidMotion, evaluate_map
+memory = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+long = np.zeros((1000, 2, 2))
+long[:, 1, 0], long[:, :, 1] = 1e4, np.arange(1000)[:, None]
+short = np.array([[[0.0, 0.0], [1.0, 0.0]]])
+truth, found = (long, short) if sys.argv[1] == "truth" else (short, long)
+before = memory()
+evaluate_map(truth, found, RigidMotion(np.eye(2), np.zeros(2)), short[0])
+print(memory() - before)
+"""
+    command = [sys.executable, "-c", code, where]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert float(done.stdout) < MEBIBYTES
