@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sofjax.io.errors import InputError
+from sofjax.io.errors import InputError, quoted
 
 if TYPE_CHECKING:
     from sofjax.vision.boards import Board, Correspondences
@@ -124,12 +124,12 @@ def board(args: argparse.Namespace) -> "Board":
     what = {"chessboard": "inner corners", "charuco": "squares"}.get(args.pattern, "circles")
     if len(sides) != 2 or not all(side.strip().isdecimal() for side in sides):
         raise InputError(
-            f"--board is '{args.board:.40}'; it must be the {what} along and across, like 9x6"
+            f"--board is {quoted(args.board)}; it must be the {what} along and across, like 9x6"
         )
     columns, rows = map(int, sides)
     if not (MIN_CORNERS <= min(columns, rows) and max(columns, rows) <= MAX_CORNERS):
         raise InputError(
-            f"--board is '{args.board:.40}'; each side must have from {MIN_CORNERS} to "
+            f"--board is {quoted(args.board)}; each side must have from {MIN_CORNERS} to "
             f"{MAX_CORNERS} {what}"
         )
     if not 0 < args.square <= 1:  # also what is no number

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sofjax.io.errors import InputError, nearest
+from sofjax.io.errors import InputError, nearest, quoted
 
 if TYPE_CHECKING:
     from sofjax.calibration import DriveFit
@@ -121,7 +121,7 @@ def free_names(text: str) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     for name in names:
         if name not in FREE:
-            raise InputError(f"--free: there is no {name!r:.40}; {nearest(name, FREE)}")
+            raise InputError(f"--free: there is no {quoted(name)}; {nearest(name, FREE)}")
     if not set(names) & set(FREE[:4]):
         raise InputError("--free: one of height, pitch, roll and yaw at least must be free")
     return names

@@ -5,7 +5,7 @@ import dataclasses
 
 from sofjax import presets
 from sofjax.cli.run import LOOPS
-from sofjax.io.errors import InputError, nearest
+from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.io.settings import INLINE, read_toml, to_dict, with_settings
 from sofjax.segment_map import MapRules
 from sofjax.slam import SlamConfig
@@ -82,7 +82,7 @@ def _changed(settings: RunSettings, given: dict[str, object], where: str) -> Run
 def _preset(name: object, where: str) -> RunSettings:
     if name not in presets.PRESETS:
         hint = nearest(str(name), presets.PRESETS)
-        raise InputError(f"{where}: there is no preset {name!r:.60}; {hint}")
+        raise InputError(f"{where}: there is no preset {quoted(name)}; {hint}")
     frontend = FRONTENDS.get(name, FrontendSettings())
     return RunSettings(0, frontend, presets.PRESETS[name], CLOSINGS.get(name, "smooth"))
 
@@ -92,7 +92,7 @@ def _pairs(sets: list[str]) -> dict[str, object]:
     for pair in sets:
         name, equals, value = pair.partition("=")
         if not equals or not name.strip():
-            raise InputError(f"--set: '{pair}' must have the form name=value")
+            raise InputError(f"--set: {quoted(pair)} must have the form name=value")
         given[name.strip()] = value.strip()
     return given
 
@@ -103,9 +103,11 @@ def check(settings: RunSettings, where: str) -> None:
         if name in CHOICES:
             if value not in CHOICES[name]:
                 right = " or ".join(CHOICES[name])
-                raise InputError(f"{where}: '{name}' is '{value:.40}'; it must be {right}")
+                raise InputError(f"{where}: '{name}' is {quoted(value)}; it must be {right}")
         elif value < 0:
-            raise InputError(f"{where}: '{name}' is {value}; it must not be negative")
+            raise InputError(f"{where}: '{name}' is {quoted(value)}; it must not be negative")
         elif name in LIMITS and not LIMITS[name][0] <= value <= LIMITS[name][1]:
             low, high = LIMITS[name]
-            raise InputError(f"{where}: '{name}' is {value}; it must be from {low} to {high}")
+            raise InputError(
+                f"{where}: '{name}' is {quoted(value)}; it must be from {low} to {high}"
+            )

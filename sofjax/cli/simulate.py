@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sofjax.io.errors import InputError, nearest
+from sofjax.io.errors import InputError, nearest, quoted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -167,7 +167,9 @@ def _odometer(pairs: list[str]) -> dict[str, float]:
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals or name not in known:
-            raise InputError(f"--odometer {pair}: must be name=value; {nearest(name, known)}")
+            raise InputError(
+                f"--odometer {quoted(pair)}: must be name=value; {nearest(name, known)}"
+            )
         (given[name],) = _numbers(f"--odometer {name}", value)
     return given
 
@@ -177,10 +179,10 @@ def _size(text: str | None) -> tuple[int, int]:
         return 320, 240
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-        raise InputError(f"--size is '{text}'; it must be like 640x480")
+        raise InputError(f"--size is {quoted(text)}; it must be like 640x480")
     width, height = map(int, parts)
     if not (32 <= width <= 4096 and 24 <= height <= 4096):
-        raise InputError(f"--size is '{text}'; it must be from 32x24 to 4096x4096")
+        raise InputError(f"--size is {quoted(text)}; it must be from 32x24 to 4096x4096")
     return width, height
 
 
@@ -202,7 +204,7 @@ def _numbers(where: str, text: str) -> list[float]:
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
-        raise InputError(f"{where}: '{text}' must be numbers, with commas between") from None
+        raise InputError(f"{where}: {quoted(text)} must be numbers, with commas between") from None
     if not all(map(math.isfinite, numbers)):
-        raise InputError(f"{where}: '{text}' is not finite")
+        raise InputError(f"{where}: {quoted(text)} is not finite")
     return numbers

@@ -10,7 +10,7 @@ import numpy as np
 
 from sofjax.geometry import Camera, Mount
 from sofjax.io.camera_forms import camera_fields, lens, mapping, matrix, number, size
-from sofjax.io.errors import InputError, nearest
+from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.io.text import write_atomically
 
 ANGLES = ("pitch", "roll", "yaw")
@@ -122,9 +122,9 @@ def mount_fields(where: str, text: str) -> dict[str, float]:
     for pair in text.split(","):
         key, equals, value = (part.strip() for part in pair.partition("="))
         if not equals:
-            raise InputError(f"{where}: '{pair:.40}' must have the form height=0.6,pitch=0.26")
+            raise InputError(f"{where}: {quoted(pair)} must have the form height=0.6,pitch=0.26")
         if key in given:
-            raise InputError(f"{where}: '{key}' is given twice")
+            raise InputError(f"{where}: {quoted(key)} is given twice")
         given[key] = value
     return _mount_numbers(where, given)
 
@@ -197,7 +197,7 @@ def _mount_numbers(where: str, given: Mapping) -> dict[str, float]:
     for key in given:
         if key not in MOUNT_FIELDS:
             hint = nearest(str(key), MOUNT_FIELDS)
-            raise InputError(f"{where} has no field {key!r:.60}; {hint}")
+            raise InputError(f"{where} has no field {quoted(key)}; {hint}")
     mount = {key: number(f"{where}: '{key}'", value) for key, value in given.items()}
     if not 0 < mount.get("height", 1.0) <= 100:
         raise InputError(

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sofjax.io.errors import InputError
+from sofjax.io.errors import InputError, plain, quoted
 from sofjax.io.text import SETTINGS_BYTES, read_text
 from sofjax.io.yaml_text import parse_yaml
 
@@ -51,9 +51,8 @@ def camera_fields(path: Path) -> Mapping:
     if not cameras:
         return fields
     if len(cameras) > 1:
-        raise InputError(
-            f"{path}: holds {' and '.join(cameras)}; keep the one that took the images alone"
-        )
+        several = plain(" and ".join(cameras))
+        raise InputError(f"{path}: holds {several}; keep the one that took the images alone")
     inside = mapping(f"{path}: '{cameras[0]}'", fields[cameras[0]])
     outside = {key: value for key, value in fields.items() if key != cameras[0]}
     for key in inside.keys() & outside.keys():
@@ -66,7 +65,7 @@ def size(path: Path, fields: Mapping) -> tuple[int, int]:
     pairs = named(fields, ("resolution",))
     for key, pair in pairs.items():
         if not (isinstance(pair, list) and len(pair) == 2):
-            raise InputError(f"{path}: '{key}' is {pair!r:.60}; it must be [width, height]")
+            raise InputError(f"{path}: '{key}' is {quoted(pair)}; it must be [width, height]")
     sides = []
     for i, side in enumerate(("width", "height")):
         given = named(fields, (f"image_{side}", side)) | {k: pair[i] for k, pair in pairs.items()}
@@ -80,7 +79,7 @@ def matrix(path: Path, fields: Mapping, width: int, height: int) -> np.ndarray:
     model = named(fields, ("camera_model",))
     for key, value in model.items():
         if str(value).lower() != "pinhole":
-            raise InputError(f"{path}: '{key}' is {value!r:.60}; it must be pinhole")
+            raise InputError(f"{path}: '{key}' is {quoted(value)}; it must be pinhole")
     given = {
         key: np.array(_numbers(path, key, value, (9,))).reshape(3, 3)
         for key, value in named(fields, MATRIX).items()
@@ -165,7 +164,7 @@ def number(where: str, value: object) -> float:
     try:
         number = float("no" if isinstance(value, bool) else value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{where} is {value!r:.60}; it must be a number") from None
+        raise InputError(f"{where} is {quoted(value)}; it must be a number") from None
     if not math.isfinite(number):
         raise InputError(f"{where} is {number}; it must be finite")
     return number
@@ -175,7 +174,7 @@ def _refuse_slip(path: Path, name: str, fields: Mapping) -> None:
     """Refuse a file without a field that has one of nearly this name, which is used for nothing."""
     unused = [str(key) for key in fields if str(key).lower() not in KNOWN]
     for close in difflib.get_close_matches(name, unused, n=1, cutoff=0.7):
-        raise InputError(f"{path}: the field '{name}' is missing; did you mean '{close}'?")
+        raise InputError(f"{path}: the field '{name}' is missing; did you mean {quoted(close)}?")
 
 
 def _agreed(path: Path, given: Mapping, name: str, fields: Mapping):
@@ -193,7 +192,7 @@ def _agreed(path: Path, given: Mapping, name: str, fields: Mapping):
 def _pixels(path: Path, key: str, value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 8 <= value <= MAX_PIXELS:
         right = f"it must be whole pixels, from 8 to {MAX_PIXELS}"
-        raise InputError(f"{path}: '{key}' is {value!r:.60}; {right}")
+        raise InputError(f"{path}: '{key}' is {quoted(value)}; {right}")
     return value
 
 
@@ -203,7 +202,9 @@ def _model(path: Path, key: str, value: object) -> str:
     word = word.strip().lower() if isinstance(word, str) else None
     model = OTHER_NAMES.get(word, word)
     if model not in SIZES and model != "none":
-        raise InputError(f"{path}: '{key}' is {value!r:.60}; it must be one of {', '.join(SIZES)}")
+        raise InputError(
+            f"{path}: '{key}' is {quoted(value)}; it must be one of {', '.join(SIZES)}"
+        )
     return model
 
 

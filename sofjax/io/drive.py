@@ -224,7 +224,7 @@ def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
     if 2 * sum(there) < len(there):
         raise InputError(
             f"{table}: {len(there) - sum(there)} of its {len(there)} images are missing, "
-            f"{path / files[there.index(False)]} first; the files must lie where the list says"
+            f"{quoted(files[there.index(False)])} first; the files must lie where the list says"
         )
     nanoseconds = in_nanoseconds(at)
     if nanoseconds:

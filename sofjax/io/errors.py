@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Iterable
 
+MANY = 20  # names that a message lists
 QUOTED = 100  # characters of what a user gave that a message quotes
 
 
@@ -30,4 +31,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name[:QUOTED], known, n=1, cutoff=0.5)
     if close:
         return f"did you mean '{close[0]}'?"
+    if len(known) > MANY:
+        return f"there are {len(known)}, such as {', '.join(known[:: len(known) // 4])}"
     return f"known are {', '.join(known)}"

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from sofjax.io.errors import InputError, nearest
+from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.simulation.fittings import (
     FLOORS,
     Paint,
@@ -26,7 +26,7 @@ def make_world(name: str, seed: int = 0) -> World:
     **Raises:** `InputError` for a name that is not in `WORLDS`.
     """
     if name not in WORLDS:
-        raise InputError(f"there is no world '{name}'; {nearest(name, WORLDS)}")
+        raise InputError(f"there is no world {quoted(name)}; {nearest(name, WORLDS)}")
     rng = np.random.default_rng([seed, sorted(WORLDS).index(name)])
     corridors, way, floor = WORLDS[name](rng)
     return furnish(name, corridors, way, floor, rng)
