@@ -220,6 +220,13 @@ def test_an_odometry_that_contradicts_itself_is_told(fault):
     assert sentence is None or sentence in found[0]
 
 
+def test_a_robot_that_drives_back_where_it_came_from_contradicts_nothing():
+    read = driven()
+    xy = np.concatenate([read.xy, read.xy[::-1]])
+    both = Trajectory(PERIOD * np.arange(400), xy, np.append(read.yaw, read.yaw[::-1]))
+    assert contradictions("odometry.txt", LINES, both, both) == []
+
+
 def test_a_robot_that_stands_and_trembles_contradicts_nothing():
     rng = np.random.default_rng(0)
     read = Trajectory(PERIOD * np.arange(2000), rng.normal(0, 0.002, (2000, 2)), np.zeros(2000))

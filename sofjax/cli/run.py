@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -75,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
     drive = read_drive(args.drive)
     frontend = Frontend.of(drive, settings.frontend)
     drive = dataclasses.replace(drive, remarks=drive.remarks + frontend.remarks)
+    for contradiction in drive.contradictions:  # before it does harm
+        print(f"sofjax: {contradiction}", file=sys.stderr)
     with outputs.run_folder(args.out, drive.name, drive.path) as folder:
         write_atomically(folder / outputs.CONFIG, to_toml(to_dict(settings)))
         mount = None

@@ -24,6 +24,9 @@ STALE_PERIODS = 2.5  # of one and the same pose ...
 CAUGHT_UP = 0.6  # ... if the next step is this share of what was to be driven in that time
 ZERO = 0.02  # metres and radians about the origin: where an odometer restarts ...
 FROM = 0.3  # ... if it comes from so far away in one step
+ONE_LINE = 0.6  # share of the way along one line below which a heading is none
+SIDEWAYS = np.deg2rad(30)  # of that line to the heading
+BACKWARDS = 0.2  # share driven forward below which the robot drives backwards
 FASTEST = 60.0  # metres a second; no wheeled robot
 SHARE = 0.5  # of the usual speed: standard deviation of the speed that is not known
 MIN_TURN_RATE = 0.3  # radians a second, standard deviation of a turn rate that is not known
@@ -184,23 +187,24 @@ def contradictions(
             f"{where}, line {lines[i + 1]}: {way[i]:.4g} m in {dt[i]:.3f} s are "
             f"{speed[i]:.4g} m/s, which no wheeled robot drives; are positions in millimetres?"
         )
-    share, angle = _direction_of_travel(mended)
-    if share is None:
+    travel = _direction_of_travel(mended)
+    if travel is None:
         return found
-    if share < 0.7:
+    one_line, axis, forward = travel
+    if one_line < ONE_LINE:
         found.append(
             f"{where}: the heading does not follow the direction of travel; is the yaw in degrees, "
             "of the wrong sign, or are x and y swapped?"
         )
-    elif abs(angle) > np.deg2rad(135):
+    elif abs(axis) > SIDEWAYS:
+        found.append(
+            f"{where}: the robot drives {np.degrees(axis):.0f}° to the side of its heading; are x "
+            "and y swapped? The heading must be that of the robot's x axis, which points forward"
+        )
+    elif forward < BACKWARDS:
         found.append(
             f"{where}: the robot drives backwards by its heading; is the sign of x and y or the "
             "heading reversed? The camera must look forward along the robot's x axis"
-        )
-    elif abs(angle) > np.deg2rad(30):
-        found.append(
-            f"{where}: the robot drives {np.degrees(angle):.0f}° to the side of its heading; are x "
-            "and y swapped? The heading must be that of the robot's x axis, which points forward"
         )
     return found
 
@@ -291,11 +295,12 @@ def _chord(twist: np.ndarray) -> complex:
     return (x + 1j * y) * np.exp(0.5j * turn) * np.sinc(turn / (2 * np.pi))
 
 
-def _direction_of_travel(trajectory: Trajectory) -> tuple[float | None, float]:
-    """How much the angle between heading and travel is one and the same, 0 to 1, and that angle.
+def _direction_of_travel(trajectory: Trajectory) -> tuple[float, float, float] | None:
+    """How much of the way lies along one line of the robot's frame, 0 to 1; the angle of that line
+    to the heading, radians in (-pi/2, pi/2]; and the share of the way that is driven forward.
 
-    Over stretches of `STRETCH` metres, so that a robot that stands and trembles has none; of fewer
-    than five nothing can be said: then None.
+    Over stretches of `STRETCH` metres, so that a robot that stands and trembles has none; None for
+    fewer than five.
     """
     xy, chosen = trajectory.xy, [0]
     for i, (x, y) in enumerate(xy.tolist()):
@@ -303,9 +308,11 @@ def _direction_of_travel(trajectory: Trajectory) -> tuple[float | None, float]:
         if (x - x0) ** 2 + (y - y0) ** 2 > STRETCH**2:
             chosen.append(i)
     if len(chosen) < 6:
-        return None, 0.0
+        return None
     dx, dy = np.diff(xy[chosen], axis=0).T
     yaw = trajectory.yaw[chosen]
     along = (dx + 1j * dy) * np.exp(-0.5j * (yaw[:-1] + yaw[1:]))
-    mean = along.sum() / np.abs(along).sum()
-    return float(np.abs(mean)), float(np.angle(mean))
+    way = np.abs(along)
+    line = (along**2 / way).sum() / way.sum()  # twice the angle: forward and backward are one line
+    forward = way[along.real > 0].sum() / way.sum()
+    return float(np.abs(line)), float(np.angle(line)) / 2, float(forward)
