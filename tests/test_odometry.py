@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from sofjax.io.contradictions import contradictions
 from sofjax.io.odometry import (
     FASTER,
     LEAST,
     Outage,
     Speeds,
-    contradictions,
     extended,
     mend,
     unknown_motion,

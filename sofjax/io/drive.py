@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from sofjax.io.camera_file import CameraFile, read_camera
+from sofjax.io.contradictions import contradictions
 from sofjax.io.errors import InputError, quoted
 from sofjax.io.map_file import check_length
 from sofjax.io.odometry import (
     CLOSE,
     Outage,
-    contradictions,
     extended,
     mend,
     unknown_motion,

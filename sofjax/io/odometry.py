@@ -24,13 +24,8 @@ STALE_PERIODS = 2.5  # of one and the same pose ...
 CAUGHT_UP = 0.6  # ... if the next step is this share of what was to be driven in that time
 ZERO = 0.02  # metres and radians about the origin: where an odometer restarts ...
 FROM = 0.3  # ... if it comes from so far away in one step
-ONE_LINE = 0.6  # share of the way along one line below which a heading is none
-SIDEWAYS = np.deg2rad(30)  # of that line to the heading
-BACKWARDS = 0.2  # share driven forward below which the robot drives backwards
-FASTEST = 60.0  # metres a second; no wheeled robot
 SHARE = 0.5  # of the usual speed: standard deviation of the speed that is not known
 MIN_TURN_RATE = 0.3  # radians a second, standard deviation of a turn rate that is not known
-STRETCH = 0.1  # metres over which a direction of travel is told
 LEAST = 0.02  # metres and radians, standard deviation of a motion that nobody read
 
 
@@ -71,7 +66,7 @@ def mend(where: str, lines: np.ndarray, read: Trajectory) -> tuple[Trajectory, l
     lines, mended = lines[fresh], read
     if not fresh.all():
         mended = Trajectory(read.stamps[fresh], read.xy[fresh], np.unwrap(read.yaw[fresh]))
-    dt, way, turn = _steps(mended)
+    dt, way, turn = between_rows(mended)
     speeds = usual_speeds(mended)
     period = float(np.median(np.diff(read.stamps)))
     hole = dt > max(HOLE_PERIODS * period, HOLE_SECONDS)
@@ -140,7 +135,7 @@ def _with_pose(odometry: Trajectory, i: int, stamp: float, twist: np.ndarray) ->
 
 def usual_speeds(trajectory: Trajectory) -> Speeds:
     """The speeds below which it is for four fifths of the time that it moves."""
-    dt, way, turn = _steps(trajectory)
+    dt, way, turn = between_rows(trajectory)
 
     def usual(rate: np.ndarray) -> float:
         moving = rate[rate > MOVING]
@@ -171,45 +166,7 @@ def unknown_motion(outages: list[Outage], speeds: Speeds, stamps: np.ndarray) ->
     return np.sqrt(variance) if variance.any() else None
 
 
-def contradictions(
-    where: str, lines: np.ndarray, read: Trajectory, mended: Trajectory
-) -> list[str]:
-    """Sentences on what shows that the odometry as a whole is not what it must be.
-
-    **Arguments:** as of `mend`, and what that returned.
-    """
-    dt, way, _ = _steps(read)
-    found = []
-    speed = way / dt
-    if len(speed) and np.median(speed[way > 0] if way.any() else speed) > FASTEST:
-        i = int(np.flatnonzero(speed > FASTEST)[0])
-        found.append(
-            f"{where}, line {lines[i + 1]}: {way[i]:.4g} m in {dt[i]:.3f} s are "
-            f"{speed[i]:.4g} m/s, which no wheeled robot drives; are positions in millimetres?"
-        )
-    travel = _direction_of_travel(mended)
-    if travel is None:
-        return found
-    one_line, axis, forward = travel
-    if one_line < ONE_LINE:
-        found.append(
-            f"{where}: the heading does not follow the direction of travel; is the yaw in degrees, "
-            "of the wrong sign, or are x and y swapped?"
-        )
-    elif abs(axis) > SIDEWAYS:
-        found.append(
-            f"{where}: the robot drives {np.degrees(axis):.0f}° to the side of its heading; are x "
-            "and y swapped? The heading must be that of the robot's x axis, which points forward"
-        )
-    elif forward < BACKWARDS:
-        found.append(
-            f"{where}: the robot drives backwards by its heading; is the sign of x and y or the "
-            "heading reversed? The camera must look forward along the robot's x axis"
-        )
-    return found
-
-
-def _steps(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def between_rows(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Seconds, metres and radians (both positive) from each row to the next."""
     way = np.hypot(*np.diff(trajectory.xy, axis=0).T)
     return np.diff(trajectory.stamps), way, np.abs(np.diff(trajectory.yaw))
@@ -217,7 +174,7 @@ def _steps(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _stale(trajectory: Trajectory) -> np.ndarray:
     """[n] bool, rows that repeat the pose before while the robot drove on, as the next shows."""
-    dt, way, turn = _steps(trajectory)
+    dt, way, turn = between_rows(trajectory)
     stale = np.zeros(len(trajectory.stamps), bool)
     still = (way == 0) & (turn == 0)
     edges = np.diff(np.concatenate([[0], still.astype(int), [0]]))
@@ -262,7 +219,7 @@ def _restarts(trajectory: Trajectory) -> np.ndarray:
     """[n - 1] bool, steps that end where odometers begin and come from far away."""
     pose = np.column_stack([trajectory.xy, np.angle(np.exp(1j * trajectory.yaw))])
     at_origin = (np.abs(pose) < ZERO).all(1)
-    _, way, _ = _steps(trajectory)
+    _, way, _ = between_rows(trajectory)
     return at_origin[1:] & ~at_origin[:-1] & (way > FROM)
 
 
@@ -293,26 +250,3 @@ def _chord(twist: np.ndarray) -> complex:
     """Where an arc [3] (metres, metres, radians) ends, forward + i left."""
     x, y, turn = twist.tolist()
     return (x + 1j * y) * np.exp(0.5j * turn) * np.sinc(turn / (2 * np.pi))
-
-
-def _direction_of_travel(trajectory: Trajectory) -> tuple[float, float, float] | None:
-    """How much of the way lies along one line of the robot's frame, 0 to 1; the angle of that line
-    to the heading, radians in (-pi/2, pi/2]; and the share of the way that is driven forward.
-
-    Over stretches of `STRETCH` metres, so that a robot that stands and trembles has none; None for
-    fewer than five.
-    """
-    xy, chosen = trajectory.xy, [0]
-    for i, (x, y) in enumerate(xy.tolist()):
-        x0, y0 = xy[chosen[-1]]
-        if (x - x0) ** 2 + (y - y0) ** 2 > STRETCH**2:
-            chosen.append(i)
-    if len(chosen) < 6:
-        return None
-    dx, dy = np.diff(xy[chosen], axis=0).T
-    yaw = trajectory.yaw[chosen]
-    along = (dx + 1j * dy) * np.exp(-0.5j * (yaw[:-1] + yaw[1:]))
-    way = np.abs(along)
-    line = (along**2 / way).sum() / way.sum()  # twice the angle: forward and backward are one line
-    forward = way[along.real > 0].sum() / way.sum()
-    return float(np.abs(line)), float(np.angle(line)) / 2, float(forward)
