@@ -14,6 +14,7 @@ from sofjax.io.trajectory import Trajectory, gaps
 SLACK = 0.06  # seconds that a true pose may lie beyond the estimate's ends
 NEAR_IN_TIME = 0.75  # of the usual time between estimates, from one of them; in a gap of theirs
 SPACING = 0.02  # metres between the samples of a map
+PAIRS = 1e9  # of samples and segments that are compared at most
 SAMPLES = 1_000_000  # of a map at most: 20 km of lines
 NEAR = 0.05  # metres from a true line within which a sample is right ...
 PARALLEL = np.deg2rad(5)  # ... if its direction is this near too
@@ -144,7 +145,7 @@ def evaluate_map(
     - `path`: [n, 2], true positions of the robot, metres: what it drove past.
     """
     segments = motion.apply(segments)
-    spacing = max(_spacing(segments), _spacing(truth))
+    spacing = max(_spacing(segments, truth), _spacing(truth, segments))
     points, angles = sample(segments, spacing)
     distance = distance_to_segments(points, angles, truth)
     right = distance <= NEAR
@@ -160,10 +161,10 @@ def evaluate_map(
     )
 
 
-def _spacing(segments: np.ndarray) -> float:
-    """Metres between samples: 2 cm, and more where there would be too many."""
+def _spacing(segments: np.ndarray, others: np.ndarray) -> float:
+    """Metres between samples: 2 cm, and more where they, or what they meet, would be too many."""
     length = float(np.hypot(*(segments[:, 1] - segments[:, 0]).T).sum())
-    return max(SPACING, length / SAMPLES)
+    return max(SPACING, length / min(SAMPLES, PAIRS / max(1, len(others))))
 
 
 def sample(segments: np.ndarray, spacing: float = SPACING) -> tuple[np.ndarray, np.ndarray]:

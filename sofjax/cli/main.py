@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 
 from sofjax.cli import calibrate, demo, evaluate, inspect, run, simulate, stopping
-from sofjax.io.errors import InputError
+from sofjax.io.errors import InputError, quoted
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,7 +49,7 @@ def _keep_compilations() -> None:
     except OSError:
         writable = False
     if not writable:
-        raise InputError(f"SOFJAX_CACHE: '{folder}' must be a folder that can be written to")
+        raise InputError(f"SOFJAX_CACHE: {quoted(folder)} must be a folder that can be written to")
     import jax
 
     jax.config.update("jax_compilation_cache_dir", os.path.abspath(folder))

@@ -9,7 +9,7 @@ import numpy as np
 from sofjax.io.camera_file import CameraFile, read_camera
 from sofjax.io.contradictions import contradictions
 from sofjax.io.errors import InputError, quoted
-from sofjax.io.map_file import check_length
+from sofjax.io.map_file import check_segments
 from sofjax.io.odometry import (
     CLOSE,
     Outage,
@@ -139,7 +139,7 @@ def read_floor_segments(path: Path) -> np.ndarray:
             )
         where = f"{path}, line {number}"
         table.append([finite(where, word.strip()) for word in words[:4]])
-        check_length(where, np.reshape(table[-1], (1, 2, 2)))
+        check_segments(where, np.reshape(table[-1], (1, 2, 2)))
     if not table:
         raise InputError(f"{path}: no segment in it; without truth there must be no such file")
     return np.array(table).reshape(-1, 2, 2)

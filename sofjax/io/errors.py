@@ -8,16 +8,21 @@ QUOTED = 100  # characters of what a user gave that a message quotes
 
 
 class InputError(ValueError):
-    """One sentence for the user: where it is, what is wrong, and what would be right."""
+    """One sentence for the user: where it is, what is wrong, and what would be right.
+
+    It is one line: characters that cannot be printed are escaped.
+    """
+
+    def __init__(self, sentence: str):
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in sentence))
 
 
 def quoted(value: object) -> str:
-    """What a user gave as a message quotes it: on one line, and of a long text its beginning."""
+    """What a user gave as a message quotes it: of a long text its beginning."""
     if not isinstance(value, str):
         value = repr(value)
         return value if len(value) <= QUOTED else f"{value[:QUOTED]}..."
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in value[: QUOTED + 1])
-    return f"'{text}'" if len(text) <= QUOTED else f"'{text[:QUOTED]}...'"
+    return f"'{value}'" if len(value) <= QUOTED else f"'{value[:QUOTED]}...'"
 
 
 def plain(error: Exception | str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from sofjax.io.errors import InputError, quoted
 from sofjax.io.text import DOCUMENT_BYTES, read_text, write_atomically
 
+FARTHEST = 1e7  # metres from the origin; the northings of UTM end there
 LONGEST = 10_000.0  # metres of a segment
 
 
@@ -62,18 +63,19 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ) from None
     if not np.isfinite(endpoints).all():
         raise InputError(f"{path}: a coordinate is not finite")
-    check_length(f"{path}", endpoints)
+    check_segments(f"{path}", endpoints)
     return endpoints, np.array(seen, int)
 
 
-def check_length(where: str, endpoints: np.ndarray) -> None:
+def check_segments(where: str, endpoints: np.ndarray) -> None:
     """Refuse segments [K, 2, 2] that are no line on a floor."""
     length = np.abs(endpoints[:, 1] - endpoints[:, 0]).max(axis=1, initial=0)
-    if (length > LONGEST).any():
-        raise InputError(
-            f"{where}: a segment of {length.max():.3g} m; it must be in metres, of at most "
-            f"{LONGEST:g}"
-        )
+    for what, metres, most in (("segment", length, LONGEST), ("coordinate", endpoints, FARTHEST)):
+        largest = np.abs(metres).max(initial=0)
+        if largest > most:
+            raise InputError(
+                f"{where}: a {what} of {largest:.3g} m; it must be in metres, {most:g} at most"
+            )
 
 
 def _count(path: Path, value: object) -> int:

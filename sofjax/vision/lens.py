@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from sofjax.io.camera_file import CameraFile
-from sofjax.io.errors import InputError
+from sofjax.io.errors import InputError, quoted
 
 SAMPLES = 33  # points of a segment that are looked up in the mask of what the lens saw
 MARGIN = 3  # pixels by which a detector's smoothing reaches over the edge of that
@@ -25,8 +25,8 @@ class Lens:
         self.seen = _seen(*exact)
         if self.seen.mean() < 0.05:
             raise InputError(
-                f"camera '{camera_file.name}': its 'distortion_coefficients' leave nothing of the "
-                f"image; they must be those of the model {camera_file.distortion_model}"
+                f"camera {quoted(camera_file.name)}: its 'distortion_coefficients' leave nothing "
+                f"of the image; they must be those of the model {camera_file.distortion_model}"
             )
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
