@@ -7,17 +7,20 @@ goes with it.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory, gaps
 
 SLACK = 0.06  # seconds that a true pose may lie beyond the estimate's ends
 NEAR_IN_TIME = 0.75  # of the usual time between estimates, from one of them; in a gap of theirs
-SPACING = 0.02  # metres between the samples of a map
-PAIRS = 1e9  # of samples and segments that are compared at most
-SAMPLES = 1_000_000  # of a map at most: 20 km of lines
+SPACING = 0.02  # metres between the samples of a map ...
+SAMPLES = 500_000  # ... of 10 km at most, and further apart in a longer one
+PAIRS = 5_000_000_000  # of samples and segments that are compared at most, likewise
 NEAR = 0.05  # metres from a true line within which a sample is right ...
 PARALLEL = np.deg2rad(5)  # ... if its direction is this near too
+TOGETHER = 256  # samples of about one place ...
+PLACE = 1.0  # ... of so many metres, compared at once
 IN_SIGHT = 3.0  # metres from the path within which a true line counts as seen
 
 
@@ -145,13 +148,13 @@ def evaluate_map(
     - `path`: [n, 2], true positions of the robot, metres: what it drove past.
     """
     segments = motion.apply(segments)
-    spacing = max(_spacing(segments, truth), _spacing(truth, segments))
+    spacing, true_spacing = _spacing(segments, truth), _spacing(truth, segments)
     points, angles = sample(segments, spacing)
-    distance = distance_to_segments(points, angles, truth)
+    distance = _distance_if_near(points, angles, truth)
     right = distance <= NEAR
-    true_points, true_angles = (values[::5] for values in sample(truth, spacing))
+    true_points, true_angles = (values[::5] for values in sample(truth, true_spacing))
     seen = distance_to_points(true_points, path) < IN_SIGHT
-    found = distance_to_segments(true_points, true_angles, segments) <= NEAR
+    found = _distance_if_near(true_points, true_angles, segments) <= NEAR
     return MapErrors(
         segments=len(segments),
         length_m=float(len(points) * spacing),
@@ -162,13 +165,16 @@ def evaluate_map(
 
 
 def _spacing(segments: np.ndarray, others: np.ndarray) -> float:
-    """Metres between samples: 2 cm, and more where they, or what they meet, would be too many."""
-    length = float(np.hypot(*(segments[:, 1] - segments[:, 0]).T).sum())
-    return max(SPACING, length / min(SAMPLES, PAIRS / max(1, len(others))))
+    """Metres between the samples of the segments: 2 cm, unless they would be too many."""
+    most = min(SAMPLES, PAIRS // max(1, len(others)))
+    return max(SPACING, float(np.hypot(*(segments[:, 1] - segments[:, 0]).T).sum()) / most)
 
 
 def sample(segments: np.ndarray, spacing: float = SPACING) -> tuple[np.ndarray, np.ndarray]:
-    """Points [P, 2] every 2 cm of the segments [K, 2, 2], and the directions [P] there, radians."""
+    """Points [P, 2] along the segments [K, 2, 2], and the directions [P] there, radians.
+
+    They are `spacing` metres apart, and two on each segment at least.
+    """
     d = segments[:, 1] - segments[:, 0]
     counts = np.maximum(2, (np.hypot(*d.T) / spacing).astype(int))
     owner = np.repeat(np.arange(len(segments)), counts)
@@ -200,13 +206,26 @@ def distance_to_segments(
     return nearest
 
 
+def _distance_if_near(points: np.ndarray, angles: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    """`distance_to_segments` where that is within `NEAR`, and anything beyond it elsewhere.
+
+    Points of about one place are compared at once, with the segments around them alone.
+    """
+    low, high = segments.min(axis=1) - 2 * NEAR, segments.max(axis=1) + 2 * NEAR
+    nearest = np.full(len(points), np.inf)
+    order = np.lexsort(np.floor(points / PLACE).T)
+    for i in range(0, len(points), TOGETHER):
+        part = order[i : i + TOGETHER]
+        bottom, top = points[part].min(axis=0), points[part].max(axis=0)
+        around = segments[((low <= top) & (high >= bottom)).all(axis=-1)]
+        nearest[part] = distance_to_segments(points[part], angles[part], around)
+    return nearest
+
+
 def distance_to_points(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     """[P] metres from each point to the nearest of the others [n, 2]."""
-    nearest = np.empty(len(points))
-    for part in _parts(len(points), len(others)):
-        away = points[part, None] - others
-        nearest[part] = np.hypot(away[..., 0], away[..., 1]).min(axis=1, initial=np.inf)
-    return nearest
+    distinct = np.unique(others, axis=0)  # a tree is slow on copies, as of a robot that stands
+    return cKDTree(distinct).query(points)[0]
 
 
 def _parts(rows: int, columns: int) -> list[slice]:

@@ -295,6 +295,8 @@ SETTINGS = {
     "a word": ("motion.distance_noise=much", "finite number"),
     "nan": ("motion.distance_noise=nan", "finite number"),
     "a negative one": ("motion.distance_noise=-1", "must not be negative"),
+    "digits with a line": ("filter.particles=1_0", "a whole number"),
+    "digits of another script": ("motion.distance_noise=١", "finite number"),
     "half a particle": ("filter.particles=1.5", "a whole number"),
     "no particle": ("filter.particles=0", "from 1 to"),
     "particles without end": ("filter.particles=1000000000", "from 1 to"),
@@ -317,6 +319,7 @@ TOML = {
     "an unknown one": ("[motion]\ndistance_nois = 1", "did you mean 'motion.distance_noise'"),
     "text": ('[motion]\ndistance_noise = "much"', "finite number"),
     "true": ("[filter]\nparticles = true", "a whole number"),
+    "thousands of digits": ("seed = 0x" + "f" * 5000, "from 0 to"),
     "a list": ("[filter]\nparticles = [1]", "a whole number"),
     "no particle": ("[filter]\nparticles = 0", "from 1 to"),
     "not TOML": ("[filter", "not TOML"),
@@ -393,10 +396,10 @@ def test_a_run_that_cannot_be_evaluated(refused, drive, tmp_path):
     for seen in (10**25, -1, 1.5, True, "many", None):
         features = [{"geometry": line, "properties": {"seen": seen}}]
         (folder / "map.geojson").write_text(json.dumps({"features": features}))
-        assert "map.geojson: 'seen' is " in refused("evaluate", folder, drive)
+        assert "map.geojson, feature 1: 'seen' is " in refused("evaluate", folder, drive)
     line["coordinates"][1] = [1e9, 0]
     (folder / "map.geojson").write_text(json.dumps({"features": [{"geometry": line}]}))
-    assert "map.geojson: a segment of 1e+09 m" in refused("evaluate", folder, drive)
+    assert "map.geojson, feature 1: a segment of 1e+09 m" in refused("evaluate", folder, drive)
     (folder / "map.geojson").unlink()
     (folder / "trajectory.txt").write_text("500 0 0 0 0 0 0 1\n501 0 0 0 0 0 0 1\n")
     assert "must share" in refused("evaluate", folder, drive)

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import re
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -122,7 +123,7 @@ def board(args: argparse.Namespace) -> "Board":
 
     sides = args.board.lower().replace("×", "x").split("x")
     what = {"chessboard": "inner corners", "charuco": "squares"}.get(args.pattern, "circles")
-    if len(sides) != 2 or not all(side.strip().isdecimal() for side in sides):
+    if len(sides) != 2 or not all(re.fullmatch(" *[0-9]{1,9} *", side) for side in sides):
         raise InputError(
             f"--board is {quoted(args.board)}; it must be the {what} along and across, like 9x6"
         )

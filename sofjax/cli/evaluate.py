@@ -78,11 +78,11 @@ def _map_is_driven(folder: Path) -> bool:
 def _drive_of(report: Path) -> Path:
     """The drive that a report names."""
     from sofjax.io.errors import InputError
-    from sofjax.io.text import DOCUMENT_BYTES, read_text
+    from sofjax.io.json_text import read_json
 
     try:
-        return Path(json.loads(read_text(report, "the report of the run", DOCUMENT_BYTES))["drive"])
+        return Path(read_json(report, "the report of the run")["drive"])
     except InputError as error:
         raise InputError(f"{error}; name the drive as a second argument") from None
-    except (ValueError, LookupError, TypeError, RecursionError):
+    except (LookupError, TypeError):
         raise InputError(f"{report}: names no drive; give it as a second argument") from None

@@ -2,10 +2,12 @@
 
 import argparse
 import dataclasses
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sofjax.io.errors import InputError, nearest, quoted
+from sofjax.io.numbers import decimal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -178,7 +180,7 @@ def _size(text: str | None) -> tuple[int, int]:
     if text is None:
         return 320, 240
     parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+    if len(parts) != 2 or not all(re.fullmatch("[0-9]{1,9}", part) for part in parts):
         raise InputError(f"--size is {quoted(text)}; it must be like 640x480")
     width, height = map(int, parts)
     if not (32 <= width <= 4096 and 24 <= height <= 4096):
@@ -202,7 +204,7 @@ def _numbers(where: str, text: str) -> list[float]:
     import math
 
     try:
-        numbers = [float(word) for word in text.split(",")]
+        numbers = [decimal(word) for word in text.split(",")]
     except ValueError:
         raise InputError(f"{where}: {quoted(text)} must be numbers, with commas between") from None
     if not all(map(math.isfinite, numbers)):

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from sofjax.io.errors import InputError, plain, quoted
+from sofjax.io.numbers import decimal
 from sofjax.io.text import SETTINGS_BYTES, read_text
 from sofjax.io.yaml_text import parse_yaml
 
@@ -162,7 +163,7 @@ def named(fields: Mapping, names: Sequence[str]) -> dict[str, object]:
 def number(where: str, value: object) -> float:
     """A finite number; YAML 1.1 takes '1e-5' for a word, as calibration tools write it."""
     try:
-        number = float("no" if isinstance(value, bool) else value)
+        number = decimal(str("no" if isinstance(value, bool) else value))
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{where} is {quoted(value)}; it must be a number") from None
     if not math.isfinite(number):

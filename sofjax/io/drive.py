@@ -9,7 +9,7 @@ import numpy as np
 from sofjax.io.camera_file import CameraFile, read_camera
 from sofjax.io.contradictions import contradictions
 from sofjax.io.errors import InputError, quoted
-from sofjax.io.map_file import check_segments
+from sofjax.io.numbers import MAX_SEGMENTS, check_segment
 from sofjax.io.odometry import (
     CLOSE,
     Outage,
@@ -138,8 +138,11 @@ def read_floor_segments(path: Path) -> np.ndarray:
                 f"{path}, line {number}: {len(words)} columns where there must be x1,y1,x2,y2,kind"
             )
         where = f"{path}, line {number}"
-        table.append([finite(where, word.strip()) for word in words[:4]])
-        check_segments(where, np.reshape(table[-1], (1, 2, 2)))
+        ends = [finite(where, word.strip()) for word in words[:4]]
+        check_segment(where, *ends)
+        if len(table) == MAX_SEGMENTS:
+            raise InputError(f"{where}: more than {MAX_SEGMENTS} segments are too many to compare")
+        table.append(ends)
     if not table:
         raise InputError(f"{path}: no segment in it; without truth there must be no such file")
     return np.array(table).reshape(-1, 2, 2)

@@ -19,10 +19,13 @@ class InputError(ValueError):
 
 def quoted(value: object) -> str:
     """What a user gave as a message quotes it: of a long text its beginning."""
-    if not isinstance(value, str):
+    if isinstance(value, str):
+        return f"'{value}'" if len(value) <= QUOTED else f"'{value[:QUOTED]}...'"
+    try:
         value = repr(value)
-        return value if len(value) <= QUOTED else f"{value[:QUOTED]}..."
-    return f"'{value}'" if len(value) <= QUOTED else f"'{value[:QUOTED]}...'"
+    except (ValueError, RecursionError):  # more digits or more levels than Python writes
+        return "too long to be quoted"
+    return value if len(value) <= QUOTED else f"{value[:QUOTED]}..."
 
 
 def plain(error: Exception | str) -> str:

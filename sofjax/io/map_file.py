@@ -1,5 +1,6 @@
 """The map of floor segments as GeoJSON: LineStrings in world metres."""
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -7,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from sofjax.io.errors import InputError, quoted
-from sofjax.io.text import DOCUMENT_BYTES, read_text, write_atomically
+from sofjax.io.json_text import read_json
+from sofjax.io.numbers import MAX_SEGMENTS, check_segment
+from sofjax.io.text import write_atomically
 
-FARTHEST = 1e7  # metres from the origin; the northings of UTM end there
-LONGEST = 10_000.0  # metres of a segment
+MAX_SEEN = 2**31 - 1
 
 
 def write_map(
@@ -39,46 +41,41 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """The segments [K, 2, 2] in world metres, and how often each was seen [K].
 
     A line of several points is as many segments; features that are no LineString are passed over.
+
+    **Raises:** `InputError` that names the feature.
     """
-    try:
-        document = json.loads(read_text(path, "the map", DOCUMENT_BYTES))
-        features = document["features"]
-        segments, seen = [], []
-        for feature in features:
+    path = Path(path)
+    document = read_json(path, "the map")
+    features = document.get("features") if isinstance(document, dict) else None
+    if not isinstance(features, list):
+        raise InputError(f"{path}: must be GeoJSON, a FeatureCollection of LineStrings in metres")
+    endpoints, seen = [], []
+    for number, feature in enumerate(features, start=1):
+        where = f"{path}, feature {number}"
+        try:
             if feature["geometry"]["type"] != "LineString":
                 continue
-            points = np.array([p[:2] for p in feature["geometry"]["coordinates"]], float)
-            points = points.reshape(-1, 2)
-            segments += list(np.stack([points[:-1], points[1:]], axis=1))
+            points = [_point(where, *p[:2]) for p in feature["geometry"]["coordinates"]]
             count = (feature.get("properties") or {}).get("seen", 0)
-            seen += [_count(path, count)] * (len(points) - 1)
-        endpoints = np.array(segments, float).reshape(-1, 2, 2)
-    except InputError:
-        raise
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}: not JSON: {error.msg}") from None
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
-        raise InputError(
-            f"{path}: must be GeoJSON, a FeatureCollection of LineStrings in metres"
-        ) from None
-    if not np.isfinite(endpoints).all():
-        raise InputError(f"{path}: a coordinate is not finite")
-    check_segments(f"{path}", endpoints)
-    return endpoints, np.array(seen, int)
-
-
-def check_segments(where: str, endpoints: np.ndarray) -> None:
-    """Refuse segments [K, 2, 2] that are no line on a floor."""
-    length = np.abs(endpoints[:, 1] - endpoints[:, 0]).max(axis=1, initial=0)
-    for what, metres, most in (("segment", length, LONGEST), ("coordinate", endpoints, FARTHEST)):
-        largest = np.abs(metres).max(initial=0)
-        if largest > most:
+        except (LookupError, TypeError, AttributeError):
             raise InputError(
-                f"{where}: a {what} of {largest:.3g} m; it must be in metres, {most:g} at most"
-            )
+                f"{where}: must be a GeoJSON feature with a geometry, such as a LineString of "
+                "[x, y] in metres"
+            ) from None
+        if type(count) is not int or not 0 <= count <= MAX_SEEN:
+            raise InputError(f"{where}: 'seen' is {quoted(count)}; it must be a number of images")
+        for ends in itertools.pairwise(points):
+            check_segment(where, *ends[0], *ends[1])
+            endpoints.append(ends)
+            seen.append(count)
+    if len(endpoints) > MAX_SEGMENTS:
+        raise InputError(f"{path}: {len(endpoints)} segments are too many; at most {MAX_SEGMENTS}")
+    return np.array(endpoints, float).reshape(-1, 2, 2), np.array(seen, int)
 
 
-def _count(path: Path, value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**31:
-        raise InputError(f"{path}: 'seen' is {quoted(value)}; it must be a whole number of images")
-    return value
+def _point(where: str, x: object, y: object) -> tuple[float, float]:
+    for value in (x, y):
+        if type(value) not in (int, float):
+            raise InputError(f"{where}: a coordinate is {quoted(value)}; it must be metres")
+    check_segment(where, x, y, x, y)
+    return float(x), float(y)

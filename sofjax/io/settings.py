@@ -8,11 +8,12 @@ import dataclasses
 import json
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 from sofjax.io.errors import InputError, nearest, plain, quoted
+from sofjax.io.numbers import decimal, whole
 from sofjax.io.text import SETTINGS_BYTES, read_text
 
 Config = TypeVar("Config")
@@ -112,13 +113,14 @@ def _cast(where: str, value: object, like: Setting) -> Setting:
             return value
         right = "true or false"
     elif isinstance(like, int):
-        if (text and _parses(int, value)) or type(value) is int:
-            return int(value)
+        number = _parsed(whole, value) if text else value
+        if type(number) is int:
+            return number
         right = "a whole number"
     elif isinstance(like, float):
-        if (text and _parses(float, value)) or type(value) in (int, float):
-            if abs(float(value) if text else value) <= sys.float_info.max:
-                return float(value)
+        number = _parsed(decimal, value) if text else value
+        if type(number) in (int, float) and abs(number) <= sys.float_info.max:
+            return float(number)
         right = "a finite number"
     else:
         if text:
@@ -127,12 +129,11 @@ def _cast(where: str, value: object, like: Setting) -> Setting:
     raise InputError(f"{where} is {quoted(value)}; it must be {right}")
 
 
-def _parses(kind: type, text: str) -> bool:
+def _parsed(kind: Callable[[str], Setting], text: str) -> Setting | None:
     try:
-        kind(text)
+        return kind(text)
     except ValueError:
-        return False
-    return True
+        return None
 
 
 def _toml(value: Setting) -> str:

@@ -11,8 +11,7 @@ from typing import BinaryIO, TextIO
 from sofjax.io.errors import InputError
 
 TABLE_BYTES = 256 * 1024 * 1024  # an hour of odometry at 100 Hz has 25 MB
-SETTINGS_BYTES = 1024 * 1024
-DOCUMENT_BYTES = 16 * 1024 * 1024  # of JSON, which takes twenty times as much when it is read
+SETTINGS_BYTES = 96 * 1024  # also a camera's, with the corners of the images that it is from
 LINE, LINES = 16384, 5_000_000  # characters and lines of a table; an hour at 1 kHz has 3,600,000
 PART = ".sofjax-part"  # ends the name of a file that is being written
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import re
 from array import array
 from dataclasses import dataclass
 from io import FileIO
@@ -11,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from sofjax.io.errors import InputError, quoted
+from sofjax.io.numbers import decimal
 from sofjax.io.text import rows, write_atomically
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 HEAD = f"# T_world_robot: {COLUMNS}\n"
 GAP = 2.5  # times the usual time from stamp to stamp, beyond which some are missing
-NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LARGEST = 1e20  # nanoseconds of an epoch have 19 digits
 MANY = 12  # lines that a sentence names
 
@@ -157,11 +156,11 @@ def _pose(where: str, line: str) -> list[float]:
 
 
 def finite(where: str, word: str) -> float:
-    """A plain decimal number of a table, or the sentence that says why it is none."""
-    if not NUMBER.fullmatch(word):
-        known = word.lower().lstrip("+-") in ("nan", "inf", "infinity")
-        raise InputError(f"{where}: {quoted(word)} is not a {'finite ' * known}number")
-    value = float(word)
+    """A number of a table, or the sentence that says why it is none."""
+    try:
+        value = decimal(word)
+    except ValueError:
+        raise InputError(f"{where}: {quoted(word)} is not a number") from None
     if not abs(value) <= LARGEST:
         raise InputError(f"{where}: {quoted(word)} is not a finite number")
     return value
