@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import jit_quickly
 
 from sofjax import slam
 from sofjax.cli import main
@@ -60,7 +61,7 @@ def write(file, rows):
     file.write_text("".join(" ".join(f"{v:.9f}" for v in row) + "\n" for row in rows))
 
 
-@jax.jit
+@jit_quickly
 def followed(camera, mount, log):
     state = slam.init(DEFAULT, camera, mount, jax.random.key(0), CAPACITY)
     return slam.run(DEFAULT, camera, mount, state, log)[1].T_world_robot
