@@ -54,8 +54,10 @@ def set_up(config: SlamConfig, drive: Drive, log: Observation) -> list[str]:
     )
     if better:
         better = sorted(better, reverse=True)
-        then = ", or ".join(f"if {words} ({100 * more:.0f} % then)" for more, words in better)
-        return [f"{said}Far more would {then}"]
+        causes = ", or ".join(
+            f"{words} ({100 * more:.0f} % with that mended)" for more, words in better
+        )
+        return [f"{said}Likely cause: {causes}"]
     return [
         f"{said}Likely causes, the likeliest first: pitch, height or roll of the mount; the clocks "
         "of images and odometry; the camera's matrix or lens; the odometry's units or axes"
@@ -91,7 +93,8 @@ def _usual_mistakes(odometry: Trajectory, mount: Mount) -> Iterator[tuple[str, T
     for turn in (-np.pi / 2, np.pi / 2, np.pi):
         roll = float(wrap(mount.roll + turn))
         turned = dataclasses.replace(mount, roll=jnp.asarray(roll, float))
-        yield f"the mount's roll is {round(roll, 2) + 0.0:.2f}", odometry, turned
+        words = f"the mount's roll, {round(roll, 2) + 0.0:.2f} rather than {float(mount.roll):.2f}"
+        yield words, odometry, turned
 
 
 def fitted_height(fitted: float, start: float) -> list[str]:

@@ -180,4 +180,6 @@ def test_inspect_calls_a_wrong_set_up_doubtful(drive, tmp_path, capfd):
     write(drive / "odometry.txt", rows[:, [0, 2, 1, *range(3, 8)]])
     assert main(["inspect", str(drive), "--out", str(tmp_path / "a.png")]) == 3
     told = capfd.readouterr().out
-    assert "if x and y of the odometry are swapped" in told and "verdict   doubtful" in told
+    assert (
+        "Likely cause: x and y of the odometry are swapped" in told and "verdict   doubtful" in told
+    )
