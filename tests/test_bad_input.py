@@ -325,6 +325,8 @@ TOML = {
     "not TOML": ("[filter", "not TOML"),
     "a name twice": ("seed = 1\nseed = 2", "not TOML"),
     "no text": ("\x00", "not TOML"),
+    "a preset that is a list": ("preset = [1]", "no preset [1]"),
+    "a preset of many digits": ("preset = 0x" + "f" * 5000, "no preset too long"),
     "a preset that is a number": ("preset = 3", "no preset 3"),
 }
 

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sofjax.cli.main import _parser
+from sofjax.cli.settings import gather
 from sofjax.io.camera_file import mount_fields, read_camera
 from sofjax.io.drive import read_drive
 from sofjax.io.errors import InputError
 from sofjax.io.map_file import read_map
-from sofjax.io.settings import read_toml, with_settings
 from sofjax.io.trajectory import read_trajectory
 from sofjax.io.yaml_text import parse_yaml
-from sofjax.presets import DEFAULT
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 ROWS = 6  # of each table
@@ -28,7 +28,7 @@ MAP = (
     '{"type": "Feature", "properties": {"seen": 12, "height": 0.01},\n'
     '"geometry": {"type": "LineString", "coordinates": [[0.1, 2.0], [3.0, -4.5]]}}]}\n'
 )
-TOML = 'seed = 3\nloop = "none"\n[motion]\ndistance_noise = 0.01\n[filter]\nsoft = false\n'
+TOML = 'seed = 3\npreset = "paper"\nloop = "none"\n[motion]\ndistance_noise = 0.01\n[filter]\nsoft = false\n'
 KALIBR = (
     "cam0:\n  camera_model: pinhole\n  intrinsics: [270.0, 270.0, 159.5, 119.5]\n"
     "  distortion_model: radtan\n  distortion_coeffs: [-0.1, 0.05, 0.0, 0.0]\n"
@@ -133,9 +133,8 @@ def test_a_map(folder, data):
 @given(data=spoilt(TOML))
 def test_a_settings_file(folder, data):
     (folder / "c.toml").write_bytes(data)
-    refuses_in_a_sentence(
-        lambda: with_settings(DEFAULT, read_toml(folder / "c.toml"), str(folder / "c.toml"))
-    )
+    args = _parser().parse_args(["run", "drive", "--config", str(folder / "c.toml")])
+    refuses_in_a_sentence(gather, args)
 
 
 @budget(300)

@@ -78,11 +78,12 @@ def test_tables_that_unfold(tmp_path):
 
 
 DOCUMENTS = {
-    "dots": ("settings", "a" + ".a" * 300_000 + " = 1"),
-    "dots of a table": ("settings", "[a" + ".a" * 300_000 + "]"),
-    "a long name": ("settings", "a" * 500_000),
-    "deep lists": ("settings", "a = " + "[" * 100_000),
-    "a number of many digits": ("settings", "a = " + "9" * 900_000),
+    "dots": ("settings", "a" + ".a" * 45_000 + " = 1"),
+    "more than a file may have": ("settings", "a" + ".a" * 300_000 + " = 1"),
+    "dots of a table": ("settings", "[a" + ".a" * 45_000 + "]"),
+    "a long name": ("settings", "a" * 90_000),
+    "deep lists": ("settings", "a = " + "[" * 90_000),
+    "a number of many digits": ("settings", "a = " + "9" * 90_000),
     "deep JSON": ("map", "[" * 1_000_000),
     "a long word": ("map", '"' + "a" * 10_000_000),
     "empty features": ("map", '{"features": [' + ",".join(["{}"] * 3_000_000) + "]}"),
@@ -91,8 +92,8 @@ DOCUMENTS = {
     "empty names": ("map", '{"features": [' + ",".join(['{"":0}'] * 1_900_000) + "]}"),
     "a list of numbers": ("camera", "a: [" + "1," * 45_000 + "]"),
     "colons": ("camera", "image_width: " + "1:" * 2500 + "1"),
-    "digits": ("camera", "image_width: " + "1" * 900_000),
-    "braces": ("camera", "{" * 900_000),
+    "digits": ("camera", "image_width: " + "1" * 90_000),
+    "braces": ("camera", "{" * 90_000),
     "words": ("camera", "- a\n" * 10_000),
 }
 

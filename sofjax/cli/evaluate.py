@@ -1,7 +1,6 @@
 """`sofjax evaluate`: a run against the truth."""
 
 import argparse
-import json
 from pathlib import Path
 
 
@@ -66,12 +65,14 @@ def run(args: argparse.Namespace) -> int:
 def _map_is_driven(folder: Path) -> bool:
     """Whether the run was killed before it wrote the map that goes with its smoothed trajectory."""
     from sofjax.cli import outputs
+    from sofjax.io.errors import InputError
+    from sofjax.io.json_text import read_json
 
     try:
-        of_map = json.loads((folder / outputs.REPORT).read_text(encoding="utf-8"))["map"]
+        of_map = read_json(folder / outputs.REPORT, "the report of the run")["map"]
         driven = of_map["of"] == outputs.TRAJECTORY
         return driven and of_map["sha256"] == outputs.digest(folder / outputs.MAP)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+    except (OSError, InputError, LookupError, TypeError):
         return False
 
 

@@ -5,9 +5,12 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import NoReturn
 
 from sofjax.cli import calibrate, demo, evaluate, inspect, run, simulate, stopping
 from sofjax.io.errors import InputError, quoted
+
+QUOTED = 200  # characters of the message of a word that is no option
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -56,8 +59,15 @@ def _keep_compilations() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many are small
 
 
+class _Parser(argparse.ArgumentParser):
+    """One that quotes little of what it was given."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(message if len(message) <= QUOTED else f"{message[:QUOTED]}...")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="sofjax", description="Segments-on-floor SLAM: a drive in, a trajectory and a map out."
     )
     parser.add_argument("--version", action="version", version=f"sofjax {version('sofjax')}")

@@ -80,8 +80,8 @@ def _changed(settings: RunSettings, given: dict[str, object], where: str) -> Run
 
 
 def _preset(name: object, where: str) -> RunSettings:
-    if name not in presets.PRESETS:
-        hint = nearest(str(name), presets.PRESETS)
+    if not isinstance(name, str) or name not in presets.PRESETS:
+        hint = nearest(name if isinstance(name, str) else "", presets.PRESETS)
         raise InputError(f"{where}: there is no preset {quoted(name)}; {hint}")
     frontend = FRONTENDS.get(name, FrontendSettings())
     return RunSettings(0, frontend, presets.PRESETS[name], CLOSINGS.get(name, "smooth"))

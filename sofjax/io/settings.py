@@ -20,7 +20,7 @@ Config = TypeVar("Config")
 Setting = bool | int | float | str
 
 INLINE = {"inline": True}
-DOTS = 100  # in a line
+DOTS = 100  # in a name
 
 
 def to_dict(config: Any) -> dict[str, Setting]:
@@ -54,8 +54,11 @@ def read_toml(path: Path) -> dict[str, object]:
     path = Path(path)
     text = read_text(path, "the settings file", SETTINGS_BYTES)
     for number, line in enumerate(text.splitlines(), start=1):
-        if line.count(".") > DOTS:  # a key of many takes the square of their number
-            raise InputError(f"{path}, line {number}: {line.count('.')} dots, in no setting's name")
+        dots = line.partition("#")[0].partition("=")[0].count(".")
+        if dots > DOTS:  # a key of many takes the square of their number
+            raise InputError(
+                f"{path}, line {number}: {dots} dots in a name; no setting has so many"
+            )
     try:
         return dict(_flatten(tomllib.loads(text), ""))
     except (tomllib.TOMLDecodeError, ValueError, RecursionError) as error:
