@@ -28,7 +28,10 @@ MAP = (
     '{"type": "Feature", "properties": {"seen": 12, "height": 0.01},\n'
     '"geometry": {"type": "LineString", "coordinates": [[0.1, 2.0], [3.0, -4.5]]}}]}\n'
 )
-TOML = 'seed = 3\npreset = "paper"\nloop = "none"\n[motion]\ndistance_noise = 0.01\n[filter]\nsoft = false\n'
+TOML = (
+    'seed = 3\npreset = "paper"\nloop = "none"\n[motion]\ndistance_noise = 0.01\n'
+    "[filter]\nsoft = false\n"
+)
 KALIBR = (
     "cam0:\n  camera_model: pinhole\n  intrinsics: [270.0, 270.0, 159.5, 119.5]\n"
     "  distortion_model: radtan\n  distortion_coeffs: [-0.1, 0.05, 0.0, 0.0]\n"
