@@ -1,8 +1,10 @@
 """Strict JAX for every test: no silent promotion of types, and float64 where a test asks for it."""
 
 import functools
+import gc
 import os
 import tempfile
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -75,3 +77,16 @@ def mounts(rng):
         )
         for _ in range(8)
     ]
+
+
+MAPS = 30_000  # of a process's memory: every compiled program takes some, and Linux allows 65,530
+
+
+@pytest.fixture(autouse=True)
+def room_for_programs():
+    """A worker that has compiled hundreds of programs forgets them before it runs out of maps."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MAPS:
+        jax.clear_caches()
+        gc.collect()
