@@ -13,6 +13,7 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
 from sofjax.observation import Observation
 
+UNREAD = (0.3, 0.3, 0.3)  # metres and radians, standard deviation of a motion that is not a number
 BIAS = ("distance", "left", "right", "curvature")  # names of the systematic errors b
 
 
@@ -34,8 +35,6 @@ class MotionModel(eqx.Module):
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip
     slip_turn: float = 0.05  # radians
-    unknown_distance: float = 0.3  # metres, standard deviation of a motion that was not read ...
-    unknown_turn: float = 0.3  # ... radians
 
 
 class OdometerBias(eqx.Module):
@@ -142,7 +141,7 @@ def sample_motion(
 
 
 def read_or_unknown(
-    model: MotionModel, odometer: SE2, sigma: Float[Array, "*batch 3"] | None
+    odometer: SE2, sigma: Float[Array, "*batch 3"] | None
 ) -> tuple[SE2, Float[Array, "*batch 3"]]:
     """The reading, and what is not known of it; a reading that is not finite says nothing.
 
@@ -155,19 +154,18 @@ def read_or_unknown(
     reading = jnp.concatenate([odometer.xy, odometer.yaw[..., None]], axis=-1)
     finite = jnp.isfinite(reading).all(-1, keepdims=True)
     reading = jnp.where(finite, reading, 0)
-    nothing = jnp.stack([model.unknown_distance, model.unknown_distance, model.unknown_turn])
-    sigma = jnp.where(finite, 0.0 if sigma is None else sigma, nothing)
+    sigma = jnp.where(finite, 0.0 if sigma is None else sigma, jnp.array(UNREAD))
     return SE2(reading[..., :2], reading[..., 2]), sigma
 
 
-def without_unread_motions(model: MotionModel, log: Observation) -> Observation:
+def without_unread_motions(log: Observation) -> Observation:
     """A log whose motions that are not finite are unknown ones; the log itself if there is none.
 
     On the host, for what sums motions up; `slam.step` asks `read_or_unknown` of each.
     """
     if np.isfinite(log.motion.xy).all() and np.isfinite(log.motion.yaw).all():
         return log
-    motion, sigma = read_or_unknown(model, log.motion, log.motion_sigma)
+    motion, sigma = read_or_unknown(log.motion, log.motion_sigma)
     return dataclasses.replace(log, motion=motion, motion_sigma=sigma)
 
 

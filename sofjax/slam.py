@@ -171,7 +171,7 @@ def step(
     key, key_motion, key_slip, key_choice = jax.random.split(state.key, 4)
 
     # 1-3) move, and sample N particles by the motion model
-    odometer, unknown = read_or_unknown(config.motion, observation.motion, observation.motion_sigma)
+    odometer, unknown = read_or_unknown(observation.motion, observation.motion_sigma)
     motion, bias = sample_motion(config.motion, state.particles.bias, odometer, key_motion)
     slip, log_ratio = sample_slip(config.motion, odometer, state.noise < SURE, key_slip, N)
     start = state.particles.T_world_robot

@@ -17,7 +17,7 @@ from sofjax.calibration.heights import FloorRules, on_floor
 from sofjax.calibration.pairs import Estimate, start_at
 from sofjax.calibration.tracks import TrackRules, follow, relate
 from sofjax.geometry import SE2, Mount, Segments, projection_matrix
-from sofjax.motion import MotionModel, without_unread_motions
+from sofjax.motion import without_unread_motions
 from sofjax.observation import Observation
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -379,11 +379,11 @@ def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
     track = follow(rules, camera, start_at(mount), unread)
     before, behind = (np.unique(part[part >= 0]) for part in (track[:20], track[20:]))
     assert len(before) == 12 and not np.intersect1d(before, behind).size
-    known = without_unread_motions(MotionModel(), log)
+    known = without_unread_motions(log)
     assert known is log
     xy = log.motion.xy.at[20, 0].set(jnp.nan)
     nan = dataclasses.replace(log, motion=SE2(xy, log.motion.yaw))
-    known = without_unread_motions(MotionModel(), nan)
+    known = without_unread_motions(nan)
     assert (np.flatnonzero(np.asarray(known.motion_sigma).any(axis=1)) == [20]).all()
     assert np.isfinite(known.motion.xy).all()
     np.testing.assert_array_equal(known.motion.xy[:20], log.motion.xy[:20])

@@ -94,7 +94,7 @@ def fit_drive(
     - `mount`: roughly.
     """
     rules = rules or DriveRules()
-    log = without_unread_motions(rules.noise.odometer, log)
+    log = without_unread_motions(log)
     searched = [_search(camera, start, log, rules) for start in starts(mount, rules)]
     ends = np.array([_place(found.fit.mount) for found in searched])
     agreeing = (_apart(ends[:, None], ends, rules) < 1).all(-1).sum(1)

@@ -100,7 +100,7 @@ def smooth(
     **Returns:** the last round's solution; `solution.converged` says whether it settled.
     """
     priors = _priors(config, rules)
-    log = without_unread_motions(config.motion, log)
+    log = without_unread_motions(log)
     with jax.enable_x64(True):
         config, camera, mount, log, path, segment_map, rules, priors = map(
             _in_double, (config, camera, mount, log, path, segment_map, rules, priors)
