@@ -18,9 +18,9 @@ from scipy.stats import t
 
 from sofjax import PRESETS, slam
 from sofjax.evaluation import evaluate_trajectory
+from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Camera, Mount
 from sofjax.io.trajectory import Trajectory
-from sofjax.observation import Observation
 from sofjax.simulation import (
     Detection,
     Scene,
@@ -92,7 +92,7 @@ def take_drive(world, rig, seed: int, images: int | None = None, detection=LSD) 
     camera, mount = rig.camera_file.camera, rig.camera_file.mount
     edges = sum(
         len(kind.contrast)
-        for kind in (world.floor_segments, world.raised_segments, world.reflections)
+        for kind in (world.floor_segments, world.off_floor_segments, world.reflections)
     )
     scene = Scene.of(world, edges=2048 * -(-edges // 2048), walls=64 * -(-len(world.walls) // 64))
     T = len(ride.truth.stamps)

@@ -9,9 +9,9 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from sofjax.extraction.observation import Observation
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
-from sofjax.observation import Observation
 
 UNREAD = (0.3, 0.3, 0.3)  # metres and radians, standard deviation of a motion that is not a number
 BIAS = ("distance", "left", "right", "curvature")  # names of the systematic errors b
@@ -193,7 +193,7 @@ def sample_slip(
     """What particles suppose that the wheels reported and the robot did not do.
 
     Slips are rare and large: many more particles try one than their rate says, and weigh less for
-    it, so that without a sighting that tells nothing changes. Those that try are drawn as
+    it, so that without a measurement that tells nothing changes. Those that try are drawn as
     systematic resampling draws: one of every 20, the first of them at random.
 
     **Arguments:**

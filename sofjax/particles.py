@@ -40,20 +40,20 @@ def effective_size(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
     return jnp.exp(-jax.nn.logsumexp(2 * log_weight))
 
 
-def systematic(tooth: Float[Array, ""], log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
-    """Indices drawn by systematic resampling, with N equally spaced teeth.
+def systematic(offset: Float[Array, ""], log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
+    """Indices drawn by systematic resampling, with N equally spaced offsets.
 
     **Arguments:**
-    - `tooth`: where the first stands, a uniform number of [0, 1).
+    - `offset`: where the first stands, a uniform number of [0, 1).
     """
     N = log_weight.shape[0]
     cumulative = jnp.cumsum(jnp.exp(log_weight))
-    teeth_up_to = jnp.ceil(N * cumulative / cumulative[-1] - tooth).astype(int)
-    return jnp.repeat(jnp.arange(N), jnp.diff(teeth_up_to, prepend=0), total_repeat_length=N)
+    offsets_up_to = jnp.ceil(N * cumulative / cumulative[-1] - offset).astype(int)
+    return jnp.repeat(jnp.arange(N), jnp.diff(offsets_up_to, prepend=0), total_repeat_length=N)
 
 
-def draw_across(
-    teeth: Float[Array, "2"],
+def resample_observable(
+    offsets: Float[Array, "2"],
     particles: Particles,
     T_tried: SE2,
     log_likelihood: Float[Array, "N"],
@@ -67,16 +67,16 @@ def draw_across(
     follow by regression on what is taken, as the yaw is what they are learned by.
 
     **Arguments:**
-    - `teeth`: uniform numbers of [0, 1), to draw what was not seen and what was.
+    - `offsets`: uniform numbers of [0, 1), to draw what was not seen and what was.
     - `T_tried`: [N] the poses that were compared: those of the particles and what these were tried
       with besides, such as a slip of the wheels. Of that too only what was seen is taken.
     - `free`: the direction, radians in the world.
 
     **Returns:** particles of equal weights.
     """
-    own = systematic(teeth[0], particles.log_weight)  # all, each once, if their weights are equal
+    own = systematic(offsets[0], particles.log_weight)  # all, each once, if their weights are equal
     log_seen = log_likelihood[own]
-    seen = own[systematic(teeth[1], log_seen - jax.nn.logsumexp(log_seen))]
+    seen = own[systematic(offsets[1], log_seen - jax.nn.logsumexp(log_seen))]
     particles = particles.take(own)
 
     middle = mean_pose(particles)

@@ -164,23 +164,23 @@ def associate(config, K, H, first, first_valid, second, second_valid):
 def log_likelihood(lines, counted, candidates, e_max, pose):
     """-1/2 sum_m min(min_k e[m,k], e_max).
 
-    `candidates[m]` are (rho, theta, kappa, W) as they should appear from the origin.
+    `candidates[m]` are (rho, theta, the apparent scale, W) as they should appear from the origin.
     """
     total = 0.0
     for line, counts, own in zip(lines, counted, candidates, strict=True):
         if not counts:
             continue
         best = e_max
-        for rho, theta, kappa, W in own:
+        for rho, theta, apparent_scale, W in own:
             n = np.array([-np.sin(theta), np.cos(theta)])
-            seen = (rho - kappa * n @ pose[:2], theta - pose[2])
+            seen = (rho - apparent_scale * n @ pose[:2], theta - pose[2])
             d = np.array(polar_difference(line, seen))
             best = min(best, d @ W @ d)
         total += best
     return -total / 2
 
 
-def best_wobble(cost, sigma):
+def best_jitter(cost, sigma):
     """The (pitch, roll) that costs least, by search on finer and finer grids about the best."""
     centre, width = np.zeros(2), 6 * sigma
     for _ in range(40):

@@ -15,9 +15,8 @@ EXPERIMENTS = PACKAGE.parent / "experiments"
 
 # each room imports from those before it; to add one is to say where it stands
 ROOMS = """
-    geometry padding observation association sof motion sightings likelihood particles segment_map
-    window slam presets batch smoothing loop_closure calibration io vision evaluation doubts
-    simulation viewer cli
+    geometry _pytree extraction motion likelihood particles segment_map slam smoothing
+    loop_closure calibration io vision evaluation simulation viewer pipeline cli
 """.split()
 CORE = ROOMS[: ROOMS.index("io")]
 MATHS = {"jax", "jaxtyping", "equinox", "optimistix", "lineax", "numpy", "sofjax"}

@@ -7,7 +7,7 @@ import pytest
 import reference
 from conftest import as_float32, jit_quickly
 
-from sofjax.association import Association, associate, association_error
+from sofjax.extraction.association import Association, associate, association_error
 from sofjax.geometry import SE2, Mount, Segments, two_view_homography
 
 pytestmark = pytest.mark.usefixtures("x64")

@@ -7,20 +7,17 @@ import numpy as np
 import pytest
 from conftest import jit_quickly
 
-from sofjax.association import Association, association_error
-from sofjax.batch import (
-    association_scores,
-    homographies,
+from sofjax.extraction import association_scores, homographies, transferred_lines
+from sofjax.extraction.association import Association, association_error
+from sofjax.extraction.sof import put_on_floor
+from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, two_view_homography
+from sofjax.geometry.two_view import transfer_segment
+from sofjax.likelihood.batch import (
     image_log_likelihood,
     log_likelihood,
     log_likelihood_pruned,
-    reach,
-    transferred_lines,
 )
-from sofjax.batch import likelihood as implementation
-from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, two_view_homography
-from sofjax.geometry.two_view import transfer_segment
-from sofjax.sof import put_on_floor
+from sofjax.likelihood.batch.evaluate import _log_likelihood
 
 NOISE = (0.15, 0.08, 9.0)  # sigma_rho, sigma_theta, e_max
 
@@ -172,10 +169,10 @@ def test_a_new_value_is_not_a_new_program():
         particles, observed, segment_map = problem(9, seed=int(10 * shift))
         log_likelihood(particles, observed, segment_map, 0.1 + shift, 0.1, 9 + shift)
         if shift == 0.0:
-            before = implementation._log_likelihood._cache_size()
-    assert implementation._log_likelihood._cache_size() == before
+            before = _log_likelihood._cache_size()
+    assert _log_likelihood._cache_size() == before
     log_likelihood(*problem(10), *NOISE)
-    assert implementation._log_likelihood._cache_size() == before + 1
+    assert _log_likelihood._cache_size() == before + 1
 
 
 def test_a_batch_of_runs_is_one_vmap():

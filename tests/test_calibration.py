@@ -10,15 +10,15 @@ import optimistix as optx
 import pytest
 from conftest import jit_quickly, make_camera
 
-from sofjax.calibration import TURNS, UNKNOWNS, FitRules, PairNoise, Pairs, distances, expected
+from sofjax.calibration import TURNS, UNKNOWNS, FitConfig, PairNoise, Pairs, distances, expected
 from sofjax.calibration import fit_mount as compiled_well
 from sofjax.calibration.fit import doubts, verdict
-from sofjax.calibration.heights import FloorRules, on_floor
+from sofjax.calibration.floor_test import FloorTestConfig, on_floor
 from sofjax.calibration.pairs import Estimate, start_at
-from sofjax.calibration.tracks import TrackRules, follow, relate
+from sofjax.calibration.tracks import TrackConfig, follow, relate
+from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Mount, Segments, projection_matrix
 from sofjax.motion import without_unread_motions
-from sofjax.observation import Observation
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -28,7 +28,7 @@ MOUNT = (0.05, 0.0, 0.6, 0.26, 0.02, 0.0)  # x, y, height, pitch, roll, yaw
 
 @jit_quickly
 def fit_mount(camera, mount, pairs, rules=None):
-    return compiled_well(camera, mount, pairs, rules or FitRules())
+    return compiled_well(camera, mount, pairs, rules or FitConfig())
 
 
 FIT = {"height": 0.6, "pitch": 0.26, "roll": 0.02}
@@ -171,7 +171,7 @@ def test_yaw_and_the_odometer_s_turns_can_be_free_too(camera, mount, rng):
     did = jax.vmap(Estimate(mount, bias).motion)(read)
     pairs = make_pairs(camera, turned, rng, np.column_stack([did.xy, did.yaw]))
     pairs = eqx.tree_at(lambda p: p.T_first_second, pairs, read)
-    rules = FitRules(free=("height", "pitch", "roll", "yaw", *TURNS), prior_sigma=(9.0,) * 8)
+    rules = FitConfig(free=("height", "pitch", "roll", "yaw", *TURNS), prior_sigma=(9.0,) * 8)
     found = fit_mount(camera, mount, pairs, rules)
     np.testing.assert_allclose(value(found), list(FIT.values()), atol=1e-3)
     assert float(found.mount.yaw) == pytest.approx(0.06, abs=1e-3)
@@ -189,11 +189,11 @@ def test_an_odometer_put_far_off_its_prior_widens_all_error_bars(camera, mount, 
         pairs,
         jax.vmap(Estimate(mount, jnp.array([0.0, -0.3, 0.0, 0.0])).motion)(pairs.T_first_second),
     )
-    rules = FitRules(free=("height", "pitch", "roll", "left"))
+    rules = FitConfig(free=("height", "pitch", "roll", "left"))
     right, wrong = (fit_mount(camera, mount, p, rules) for p in (pairs, short))
-    assert float(right.surprise) == 1 and doubts(right) == ""
+    assert float(right.birge_ratio) == 1 and doubts(right) == ""
     sigmas = float(wrong.odometer[1]) / rules.prior_sigma[5]
-    assert float(wrong.surprise) == pytest.approx(abs(sigmas)) and sigmas > 5
+    assert float(wrong.birge_ratio) == pytest.approx(abs(sigmas)) and sigmas > 5
     assert "clock or odometer" in doubts(wrong)
     ratio = np.sqrt(np.diag(wrong.covariance)[:3] / np.diag(right.covariance)[:3])
     np.testing.assert_allclose(ratio, sigmas, rtol=0.3)
@@ -209,7 +209,7 @@ def test_outliers_hardly_matter(camera, mount, rng):
 def test_height_and_the_odometer_s_scale_are_one(camera, mount, rng):
     """Both free, the priors alone share them out, and the covariance says so."""
     pairs = make_pairs(camera, mount, rng, noise=0.3)
-    rules = FitRules(free=("height", "pitch", "roll", "distance"))
+    rules = FitConfig(free=("height", "pitch", "roll", "distance"))
     found = fit_mount(camera, mount, pairs, rules)
     C = np.asarray(found.covariance)
     correlation = C[0, 4] / np.sqrt(C[0, 0] * C[4, 4])
@@ -290,7 +290,7 @@ def cramer_rao(camera, mount, pairs, sigma):
 
 
 def sentence(camera, mount, pairs):
-    rules = FitRules()
+    rules = FitConfig()
     found = fit_mount(camera, mount, weighed(camera, mount, pairs), rules)
     usable, words = verdict(found, rules, pairs)
     assert not usable
@@ -328,12 +328,12 @@ def test_what_stands_above_the_floor_is_told_by_its_height(camera, mount, rng):
     z = np.where(np.arange(N) // 6 % 3 == 0, 0.1, 0.0)  # six pairs of each line
     pairs = weighed(camera, mount, make_pairs(camera, mount, rng, noise=0.3, z=z))
     line = jnp.arange(N) // 6
-    floor = np.asarray(on_floor(FloorRules(), camera, start_at(mount), pairs, line))
+    floor = np.asarray(on_floor(FloorTestConfig(), camera, start_at(mount), pairs, line))
     assert floor[z == 0].mean() > 0.9 and floor[z > 0].mean() < 0.3
     wild = eqx.tree_at(
         lambda p: p.second, pairs, pairs.second + jnp.asarray(rng.normal(0, 15, (N, 2, 2)))
     )
-    assert not np.asarray(on_floor(FloorRules(), camera, start_at(mount), wild, line)).any()
+    assert not np.asarray(on_floor(FloorTestConfig(), camera, start_at(mount), wild, line)).any()
 
 
 @pytest.fixture
@@ -360,7 +360,7 @@ def log(camera, mount, rng):
 
 def test_lines_are_followed_though_missed_once_and_the_mount_is_rough(camera, mount, log):
     log, order = log
-    track = follow(TrackRules(), camera, start_at(off(mount, 1.25, 0.1)), log)
+    track = follow(TrackConfig(), camera, start_at(off(mount, 1.25, 0.1)), log)
     assert (track[:, 12:] == -1).all() and (track[20] == -1).sum() == 5
     of_line = np.where(track[:, :12] >= 0, track[:, :12], 0)
     for t in range(1, 40):
@@ -374,7 +374,7 @@ def test_lines_are_followed_though_missed_once_and_the_mount_is_rough(camera, mo
 
 def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
     log, _ = log
-    rules = TrackRules()
+    rules = TrackConfig()
     unread = dataclasses.replace(log, motion_sigma=jnp.zeros((40, 3)).at[20].set(0.1))
     track = follow(rules, camera, start_at(mount), unread)
     before, behind = (np.unique(part[part >= 0]) for part in (track[:20], track[20:]))
@@ -391,8 +391,8 @@ def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
 
 def test_pairs_are_nested_and_use_each_segment_once(camera, mount, log):
     log, _ = log
-    track = follow(TrackRules(), camera, start_at(mount), log)
-    pairs, line = relate(TrackRules(), log, track, 0.6, 256)
+    track = follow(TrackConfig(), camera, start_at(mount), log)
+    pairs, line = relate(TrackConfig(), log, track, 0.6, 256)
     valid = np.asarray(pairs.valid)
     assert valid.sum() > 60 and len(np.unique(np.asarray(line)[valid])) == 12
     way = np.asarray(pairs.T_first_second.xy)[valid, 0]
@@ -400,13 +400,13 @@ def test_pairs_are_nested_and_use_each_segment_once(camera, mount, log):
     used = np.concatenate([np.asarray(pairs.first)[valid], np.asarray(pairs.second)[valid]])
     assert len(np.unique(used.reshape(-1, 4), axis=0)) == len(used)
     assert (np.asarray(line)[~valid] == -1).all()
-    few, _ = relate(TrackRules(), log, track, 0.6, 32)
+    few, _ = relate(TrackConfig(), log, track, 0.6, 32)
     assert np.asarray(few.valid).all() and len(few.valid) == 32
     found = fit_mount(camera, off(mount, 1.2, 0.08), pairs)
     np.testing.assert_allclose(value(found), list(FIT.values()), atol=0.01)
 
 
 def test_unknowns_are_in_the_order_of_the_covariance(camera, mount, pairs):
-    found = fit_mount(camera, mount, pairs, FitRules(free=("pitch",)))
+    found = fit_mount(camera, mount, pairs, FitConfig(free=("pitch",)))
     assert UNKNOWNS[1] == "pitch"
     assert np.flatnonzero(np.diag(np.asarray(found.covariance)) > 0).tolist() == [1]

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from sofjax import viewer
-from sofjax.cli import main, report
+from sofjax.cli import main
 from sofjax.cli.run import views
-from sofjax.cli.tally import Tally
 from sofjax.io.drive import motions, read_drive
 from sofjax.io.map_file import read_map
 from sofjax.io.trajectory import read_trajectory
+from sofjax.pipeline import results
+from sofjax.pipeline.run_log import RunLog
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 IMAGES = 40
@@ -136,7 +137,7 @@ def test_another_seed_gives_another_trajectory(done, drive, tmp_path):
 
 
 def test_settings_come_from_the_preset_the_file_and_the_options_in_this_order(drive, tmp_path):
-    from sofjax.cli.settings import gather
+    from sofjax.pipeline.settings import gather
 
     def gathered(*args):
         from sofjax.cli.main import _parser
@@ -389,12 +390,12 @@ def test_where_nothing_seen_holds_the_distance_it_is_said(done):
     """Twenty metres, a line across the way seen up to the third and again at the twelfth."""
     drive = read_drive(OFFICE)
     poses = [np.array([x, 0.0, 0.0]) for x in range(21)]
-    tally = Tally(stamps=list(drive.image_stamps[:21]), poses=poses, across=[0] * 21)
-    tally.across[:4], tally.across[12] = [2, 1, 3, 1], 1
-    assert tally.unheld == pytest.approx(9)
-    (said,) = report.warnings(drive, tally)
+    run_log = RunLog(stamps=list(drive.image_stamps[:21]), poses=poses, across=[0] * 21)
+    run_log.across[:4], run_log.across[12] = [2, 1, 3, 1], 1
+    assert run_log.unheld == pytest.approx(9)
+    (said,) = results.warnings(drive, run_log)
     assert said.startswith("for 9.0 m no line across the way") and "odometer" in said
-    tally.across[7] = tally.across[9] = tally.across[16] = 1
-    assert tally.unheld == pytest.approx(4) and not report.warnings(drive, tally)
-    assert Tally().unheld == 0
+    run_log.across[7] = run_log.across[9] = run_log.across[16] = 1
+    assert run_log.unheld == pytest.approx(4) and not results.warnings(drive, run_log)
+    assert RunLog().unheld == 0
     assert report_of(done)["longest_without_lines_across_m"] < 1.5

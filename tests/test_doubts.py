@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sofjax import doubts
 from sofjax.geometry import SE2
 from sofjax.io.drive import motions, read_drive
 from sofjax.io.trajectory import Trajectory
 from sofjax.motion import MotionModel
-from sofjax.presets import DEFAULT
+from sofjax.pipeline import setup_checks
+from sofjax.slam.presets import DEFAULT
 from sofjax.vision import Frontend, observe_drive
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
@@ -37,7 +37,7 @@ def spoilt(seen, odometry=None, mount=None):
     drive = dataclasses.replace(drive, odometry=odometry or drive.odometry, camera_file=file)
     steps = motions(drive)
     motion = SE2(jnp.asarray(steps[:, :2], float), jnp.asarray(steps[:, 2], float))
-    return doubts.set_up(DEFAULT, drive, dataclasses.replace(log, motion=motion))
+    return setup_checks.set_up(DEFAULT, drive, dataclasses.replace(log, motion=motion))
 
 
 def test_a_set_up_that_is_right_is_not_doubted(seen):
@@ -77,32 +77,32 @@ def test_what_none_of_the_usual_mistakes_explains_is_told_by_its_share(seen):
 def test_too_few_segments_tell_nothing(seen):
     drive, log = seen
     few = jax.tree.map(lambda a: a[:2], log)
-    assert doubts.set_up(DEFAULT, drive, few) == []
+    assert setup_checks.set_up(DEFAULT, drive, few) == []
 
 
 def test_an_odometer_that_errs_as_none_does_is_told():
     model = MotionModel(distance_scale_sigma=0.01, turn_scale_sigma=0.05, curvature_sigma=0.0)
     usual = {"distance": 0.03, "left": -0.2, "right": 0.2, "curvature": 9.0}
-    assert doubts.odometer(usual, model) == []
-    (doubt,) = doubts.odometer(usual | {"distance": 0.06}, model)
+    assert setup_checks.odometer(usual, model) == []
+    (doubt,) = setup_checks.odometer(usual | {"distance": 0.06}, model)
     assert "error in distances was learned as +6.0%, 6 standard deviations" in doubt
-    (doubt,) = doubts.odometer(usual | {"right": -0.3}, model)
+    (doubt,) = setup_checks.odometer(usual | {"right": -0.3}, model)
     assert "turns to the right was learned as -30.0%" in doubt
 
 
 def test_a_height_that_no_tape_gives_is_told():
-    assert doubts.fitted_height(0.6, 0.5) == doubts.fitted_height(0.6, 0.8) == []
-    (doubt,) = doubts.fitted_height(0.2904, 0.6)
+    assert setup_checks.fitted_height(0.6, 0.5) == setup_checks.fitted_height(0.6, 0.8) == []
+    (doubt,) = setup_checks.fitted_height(0.2904, 0.6)
     assert "0.48 of the 0.6 m" in doubt and "does the odometer read half of the way" in doubt
-    (doubt,) = doubts.fitted_height(1.2, 0.6)
+    (doubt,) = setup_checks.fitted_height(1.2, 0.6)
     assert "read double of the way" in doubt
 
 
 def test_holes_in_the_images_are_told_once_each_and_not_without_end():
-    assert doubts.holes(0.1 * np.arange(50)) == []
-    assert doubts.holes(np.append(0.1 * np.arange(50), 8.9)) == [
+    assert setup_checks.holes(0.1 * np.arange(50)) == []
+    assert setup_checks.holes(np.append(0.1 * np.arange(50), 8.9)) == [
         "no image for 4.00 s from 4.90 s on"
     ]
     many = np.concatenate([0.1 * np.arange(10) + 5 * i for i in range(20)])
-    told = doubts.holes(many)
+    told = setup_checks.holes(many)
     assert len(told) == 6 and told[-1].startswith("14 more times")

@@ -156,7 +156,7 @@ TRUTH = np.array([[[0, 1], [4, 1]], [[0, -1], [4, -1]], [[0, 10], [4, 10]]], flo
 
 
 def test_a_map_with_one_right_line_one_false_and_one_missing():
-    """3 m right to 2 cm, 1 m false; 3 m are found of the 8 m in sight, which 10 m away is not."""
+    """3 m right to 2 cm, 1 m false; 3 m are found of the 8 m in view, which 10 m away is not."""
     found = np.array([[[0, 1.02], [3, 1.02]], [[1, 0], [2, 0]]], float)
     errors = evaluate_map(TRUTH, found, STILL, PATH)
     assert errors.segments == 2

@@ -12,13 +12,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sofjax.cli.main import _parser
-from sofjax.cli.settings import gather
 from sofjax.io.camera_file import mount_fields, read_camera
 from sofjax.io.drive import read_drive
 from sofjax.io.errors import InputError
 from sofjax.io.map_file import read_map
 from sofjax.io.trajectory import read_trajectory
 from sofjax.io.yaml_text import parse_yaml
+from sofjax.pipeline.settings import gather
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 ROWS = 6  # of each table

@@ -55,8 +55,8 @@ def test_roll_above_zero_lifts_the_left_of_the_camera(camera):
 
 def test_turning_on_the_spot_moves_the_camera_by_its_lever_arm():
     arm = Mount.create(height=1.0, x=0.1)
-    feet = [SE2(jnp.zeros(2), jnp.array(yaw)) @ arm.T_robot_foot for yaw in (0.0, np.pi / 2)]
-    assert jnp.linalg.norm(feet[1].xy - feet[0].xy) == pytest.approx(0.1 * np.sqrt(2))
+    nadirs = [SE2(jnp.zeros(2), jnp.array(yaw)) @ arm.T_robot_nadir for yaw in (0.0, np.pi / 2)]
+    assert jnp.linalg.norm(nadirs[1].xy - nadirs[0].xy) == pytest.approx(0.1 * np.sqrt(2))
 
 
 def test_the_camera_axes_are_a_rotation(mounts):

@@ -234,31 +234,31 @@ def test_a_line_over_the_floor_leads_each_view_to_another_floor_line(camera, mou
 
 
 def test_an_upright_line_meets_the_floor_where_its_two_floor_lines_cross(camera, mounts, rng):
-    foot = np.array([1.5, 0.4])
-    ends = np.array([[*foot, 0.3], [*foot, 1.1]])
+    nadir = np.array([1.5, 0.4])
+    ends = np.array([[*nadir, 0.3], [*nadir, 1.1]])
     for (P, l, H_F), (P2, l2, H_F2) in two_views(camera, mounts, ends, rng):
         np.testing.assert_allclose(
-            reference.trace_on_floor(reference.plane_pair(P, l, P2, l2)), foot, atol=1e-6
+            reference.trace_on_floor(reference.plane_pair(P, l, P2, l2)), nadir, atol=1e-6
         )
         for H, x in ((H_F, l), (H_F2, l2)):
             L = line_to_floor(H, jnp.asarray(x))
-            assert abs(L @ jnp.append(foot, 1.0)) < 1e-8 * jnp.linalg.norm(L)
+            assert abs(L @ jnp.append(nadir, 1.0)) < 1e-8 * jnp.linalg.norm(L)
 
 
-def test_uprights_point_to_the_foot_and_lines_of_the_floor_beside_it_do_not(camera, mounts):
+def test_uprights_point_to_the_nadir_and_lines_of_the_floor_beside_it_do_not(camera, mounts):
     for mount in mounts:
-        T, foot, ahead = SE2.identity(), mount.T_robot_foot.xy, SE2(jnp.zeros(2), mount.yaw)
+        T, nadir, ahead = SE2.identity(), mount.T_robot_nadir.xy, SE2(jnp.zeros(2), mount.yaw)
         H_F, P = floor_homography(camera, mount, T), projection_matrix(camera, mount, T)
-        foot_image = H_F @ jnp.append(foot, 1.0)
-        place = foot + ahead.apply(jnp.array([2.0, 0.7]))
+        nadir_image = H_F @ jnp.append(nadir, 1.0)
+        place = nadir + ahead.apply(jnp.array([2.0, 0.7]))
         edge = jnp.array([[*place, 0.1, 1.0], [*place, 0.6, 1.0]]) @ P.T
         edge = edge[:, :2] / edge[:, 2:]
-        assert may_be_upright(foot_image, edge, 1e-6)
+        assert may_be_upright(nadir_image, edge, 1e-6)
         for y, pointing in ((0.0, True), (0.3, False), (-0.3, False)):
-            ends = foot + ahead.apply(jnp.array([[2.0, y], [3.0, y]]))
+            ends = nadir + ahead.apply(jnp.array([[2.0, y], [3.0, y]]))
             on_floor, before = to_image(H_F, ends)
-            assert before.all() and may_be_upright(foot_image, on_floor, 1.0) == pointing
-            assert not may_be_upright(foot_image, on_floor, 0.0)
+            assert before.all() and may_be_upright(nadir_image, on_floor, 1.0) == pointing
+            assert not may_be_upright(nadir_image, on_floor, 0.0)
 
 
 def test_float32_is_good_to_a_millimetre_at_five_metres(camera, mount, rng):

@@ -14,7 +14,7 @@ import pytest
 import reference
 from conftest import jit_quickly, make_camera
 
-from sofjax.association import Association, association_error
+from sofjax.extraction.association import Association, association_error
 from sofjax.geometry import (
     SE2,
     Mount,
@@ -34,10 +34,10 @@ from sofjax.geometry import (
 from sofjax.geometry.lines import line_point_distance, polar_in_frame, polar_through
 from sofjax.geometry.segments import clip
 from sofjax.geometry.two_view import transfer_segment
-from sofjax.likelihood import Candidates, compare, pair
+from sofjax.likelihood.measurements import Measurements, SensorModel, measure
+from sofjax.likelihood.tracking import Candidates, compare, pair
 from sofjax.motion import MotionModel, prior_bias, sample_motion, sample_slip
-from sofjax.segment_map import MapRules, appear, believed
-from sofjax.sightings import SensorModel, Sightings, sight
+from sofjax.segment_map import MapConfig, posterior_given_class, predict_measurement
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -342,26 +342,26 @@ SEGMENTS = np.array(
 )
 
 
-def sighted(p, sensor):
+def measured(p, sensor):
     segments = Segments(p[6:].reshape(-1, 2, 2), jnp.ones((len(p) - 6) // 4, bool))
-    found = sight(sensor, make_camera(), mount_of(p[:6]), segments, 8.0)
-    return found.line, found.covariance, found.tilt, found.endpoints_foot
+    found = measure(sensor, make_camera(), mount_of(p[:6]), segments, 8.0)
+    return found.line, found.covariance, found.tilt, found.endpoints_nadir
 
 
-def sighted_by_default(p):
-    return sighted(p, SensorModel())
+def measured_by_default(p):
+    return measured(p, SensorModel())
 
 
-def sighted_by_the_paper(p):
-    return sighted(p, SensorModel(propagate=False))
+def measured_by_the_paper(p):
+    return measured(p, SensorModel(propagate=False))
 
 
-def test_gradients_of_sightings_and_their_covariances():
-    assert_right(sighted_by_default, [*MOUNT, *SEGMENTS.ravel()], rtol=1e-4)
+def test_gradients_of_measurements_and_their_covariances():
+    assert_right(measured_by_default, [*MOUNT, *SEGMENTS.ravel()], rtol=1e-4)
 
 
-@pytest.mark.parametrize("f", [sighted_by_default, sighted_by_the_paper])
-def test_gradients_of_degenerate_sightings_are_finite(f):
+@pytest.mark.parametrize("f", [measured_by_default, measured_by_the_paper])
+def test_gradients_of_degenerate_measurements_are_finite(f):
     row = horizon_row(np.zeros(3))
     ends = [
         [[150, 150], [150, 150]],  # no length
@@ -378,12 +378,12 @@ def test_gradients_of_degenerate_sightings_are_finite(f):
 
 
 def likelihood(p, sensor):
-    """log L and wobble by pose, mount and map; the last numbers of p are the problem's."""
+    """log L and jitter by pose, mount and map; the last numbers of p are the problem's."""
     tilt_sigma, shift, valid, used = p[12:]
     sensor = eqx.tree_at(lambda s: s.tilt_sigma, sensor, tilt_sigma)
     segments = Segments(jnp.asarray(SEGMENTS), jnp.ones(4, bool))
-    true = sight(sensor, make_camera(), mount_of(MOUNT), segments, 8.0).line
-    sightings = sight(sensor, make_camera(), mount_of(p[3:9]), segments, 8.0)
+    true = measure(sensor, make_camera(), mount_of(MOUNT), segments, 8.0).line
+    measurements = measure(sensor, make_camera(), mount_of(p[3:9]), segments, 8.0)
     offsets = shift * np.random.default_rng(1).normal(size=(4, 2, 2)) + jnp.array(
         [[0, 0], [3, 0.5]]
     )
@@ -395,7 +395,7 @@ def likelihood(p, sensor):
         line, jnp.ones((4, 2)) + p[11], W, W, jnp.broadcast_to(valid > 0.5, (4, 2))
     )
     used = jnp.broadcast_to(used > 0.5, 4)
-    found = compare(sensor, pair(sightings, candidates), pose_of(p[:3]), used)
+    found = compare(sensor, pair(measurements, candidates), pose_of(p[:3]), used)
     return found.log_likelihood, found.tilt
 
 
@@ -438,7 +438,7 @@ def test_what_is_masked_has_no_gradient(masks):
 def test_gradients_with_some_segments_masked_are_those_of_the_others():
     segments = Segments(jnp.asarray(SEGMENTS), jnp.ones(4, bool))
     sensor = SensorModel(tilt_sigma=0.002)
-    found = jit_quickly(sight)(sensor, make_camera(), mount_of(MOUNT), segments, 8.0)
+    found = jit_quickly(measure)(sensor, make_camera(), mount_of(MOUNT), segments, 8.0)
     W = 900 * jnp.broadcast_to(jnp.eye(2), (4, 1, 2, 2))
     line = PolarLine(found.line.rho[:, None] + 0.01, found.line.theta[:, None] - 0.005)
     lines = Candidates(line, jnp.ones((4, 1)), W, W, jnp.ones((4, 1), bool))
@@ -446,8 +446,8 @@ def test_gradients_with_some_segments_masked_are_those_of_the_others():
 
     @jit_quickly
     @jax.grad
-    def gradient(p, sightings, lines, used):
-        return compare(sensor, pair(sightings, lines), pose_of(p), used).log_likelihood
+    def gradient(p, measurements, lines, used):
+        return compare(sensor, pair(measurements, lines), pose_of(p), used).log_likelihood
 
     mask = jnp.isin(jnp.arange(4), keep)
     fewer = jax.tree.map(lambda a: a[keep], (found, lines))
@@ -461,7 +461,7 @@ def test_gradients_with_some_segments_masked_are_those_of_the_others():
 
 def test_padding_of_any_finite_precision_does_not_spread():
     """Candidates that are none may come with any finite precision, however large."""
-    found = Sightings(
+    found = Measurements(
         jnp.zeros((2, 2, 2)),
         jnp.array([True, False]),
         PolarLine(jnp.array([1.0, 0.0]), jnp.array([0.1, 0.0])),
@@ -489,10 +489,10 @@ def test_padding_of_any_finite_precision_does_not_spread():
 
 def test_gradients_of_how_a_map_line_appears():
     assert_right(
-        lambda p: appear(p[:3], pose_of(p[3:6]), pose_of(p[6:9]))[0],
+        lambda p: predict_measurement(p[:3], pose_of(p[3:6]), pose_of(p[6:9]))[0],
         [1.0, 0.3, 1.2, *POSE, 0.5, 0.2, -0.4],
     )
     assert_right(
-        lambda p: believed(MapRules(), p[:3], jnp.diag(p[3:6]) + p[6])[0],
+        lambda p: posterior_given_class(MapConfig(), p[:3], jnp.diag(p[3:6]) + p[6])[0],
         [1.0, 0.3, 1.01, 0.1, 0.2, 0.3, 0.01],
     )

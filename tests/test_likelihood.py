@@ -9,7 +9,8 @@ import reference
 from conftest import jit_quickly
 
 from sofjax.geometry import SE2, PolarLine
-from sofjax.likelihood import (
+from sofjax.likelihood.measurements import Measurements, SensorModel
+from sofjax.likelihood.tracking import (
     Candidates,
     adapt_noise,
     compare,
@@ -18,14 +19,13 @@ from sofjax.likelihood import (
     pair,
     pixels_and_weight,
 )
-from sofjax.sightings import SensorModel, Sightings
 
 pytestmark = pytest.mark.usefixtures("x64")
 
 
 @jit_quickly
-def compare_pose(sensor, sightings, candidates, T_predicted_foot, used):
-    return compare(sensor, pair(sightings, candidates), T_predicted_foot, used)
+def compare_pose(sensor, measurements, candidates, T_predicted_nadir, used):
+    return compare(sensor, pair(measurements, candidates), T_predicted_nadir, used)
 
 
 def pose(x, y, yaw):
@@ -33,23 +33,23 @@ def pose(x, y, yaw):
 
 
 def random_problem(rng, M=6, C=4):
-    """Sightings near one of their candidates each, candidates of every kind, and some masked."""
+    """Measurements near one of their candidates each, candidates of every kind, and some masked."""
     roots = rng.normal(size=(2, M, C, 2, 2))
     W = np.einsum("...ij,...kj->...ik", roots[0], roots[0]) * 1000 + 100 * np.eye(2)
     lines = np.stack([rng.normal(size=(M, C)) * 2, rng.uniform(-7, 7, size=(M, C))], -1)
-    kappa = rng.uniform(0.8, 1.3, size=(M, C))
+    apparent_scale = rng.uniform(0.8, 1.3, size=(M, C))
     near = lines[np.arange(M), rng.integers(C, size=M)] + rng.normal(0, 0.03, size=(M, 2))
     turns = rng.integers(-1, 2, size=M)  # named from either side
     near = np.stack([near[:, 0] * (-1.0) ** turns, near[:, 1] + turns * np.pi], 1)
-    return near, lines, kappa, W, rng.random((M, C)) < 0.8
+    return near, lines, apparent_scale, W, rng.random((M, C)) < 0.8
 
 
-def as_arrays(near, lines, kappa, W, valid, tilt=None, sigma=0.0):
+def as_arrays(near, lines, apparent_scale, W, valid, tilt=None, sigma=0.0):
     M = len(near)
     tilt = np.zeros((M, 2, 2)) if tilt is None else tilt
     loose = np.linalg.inv(np.linalg.inv(W) + sigma**2 * (tilt @ np.swapaxes(tilt, 1, 2))[:, None])
-    sightings = Sightings(
-        endpoints_foot=jnp.zeros((M, 2, 2)),
+    measurements = Measurements(
+        endpoints_nadir=jnp.zeros((M, 2, 2)),
         valid=jnp.ones(M, bool),
         line=PolarLine(jnp.asarray(near[:, 0]), jnp.asarray(near[:, 1])),
         covariance=jnp.broadcast_to(jnp.eye(2), (M, 2, 2)),
@@ -57,17 +57,21 @@ def as_arrays(near, lines, kappa, W, valid, tilt=None, sigma=0.0):
     )
     candidates = Candidates(
         PolarLine(jnp.asarray(lines[..., 0]), jnp.asarray(lines[..., 1])),
-        jnp.asarray(kappa),
+        jnp.asarray(apparent_scale),
         jnp.asarray(W),
         jnp.asarray(loose),
         jnp.asarray(valid),
     )
-    return sightings, candidates
+    return measurements, candidates
 
 
-def as_lists(lines, kappa, W, valid):
+def as_lists(lines, apparent_scale, W, valid):
     return [
-        [(*lines[m, k], kappa[m, k], W[m, k]) for k in range(len(kappa[m])) if valid[m, k]]
+        [
+            (*lines[m, k], apparent_scale[m, k], W[m, k])
+            for k in range(len(apparent_scale[m]))
+            if valid[m, k]
+        ]
         for m in range(len(lines))
     ]
 
@@ -105,20 +109,20 @@ def test_the_likelihood_is_the_loop_over_all_pairs(rng):
     assert inliers > 10
 
 
-def test_the_wobble_is_the_one_that_costs_least(rng):
-    """Against a search over all wobbles, the associations given."""
+def test_the_jitter_is_the_one_that_costs_least(rng):
+    """Against a search over all jitters, the associations given."""
     sensor = SensorModel(tilt_sigma=0.01)
     for _ in range(4):
-        near, lines, kappa, W, _ = random_problem(rng, C=1)
+        near, lines, apparent_scale, W, _ = random_problem(rng, C=1)
         J = rng.normal(size=(len(near), 2, 2))
-        # the image was taken with a wobble; one segment shows something unknown
-        wobble = rng.normal(size=2) * 0.01
+        # the image was taken with a jitter; one segment shows something unknown
+        jitter = rng.normal(size=2) * 0.01
         turns = np.round((near[:, 1] - lines[:, 0, 1]) / np.pi)
         near = np.stack([lines[:, 0, 0] * (-1.0) ** turns, lines[:, 0, 1] + np.pi * turns], 1)
-        near = near + J @ wobble + rng.normal(0, 0.01, size=near.shape)
+        near = near + J @ jitter + rng.normal(0, 0.01, size=near.shape)
         near[0] += [5.0, 0.4]
-        valid = np.ones(kappa.shape, bool)
-        arrays = as_arrays(near, lines, kappa, W, valid, J, sensor.tilt_sigma)
+        valid = np.ones(apparent_scale.shape, bool)
+        arrays = as_arrays(near, lines, apparent_scale, W, valid, J, sensor.tilt_sigma)
         found = compare_pose(sensor, *arrays, SE2.identity(), jnp.ones(len(near), bool))
         assert found.error[0] == sensor.e_max
 
@@ -129,24 +133,24 @@ def test_the_wobble_is_the_one_that_costs_least(rng):
                 total += d @ W[m, 0] @ d
             return total
 
-        best = reference.best_wobble(cost, sensor.tilt_sigma)
+        best = reference.best_jitter(cost, sensor.tilt_sigma)
         np.testing.assert_allclose(found.tilt, best, atol=1e-6)
         assert (found.error[1:] < sensor.e_max).all()
         assert found.log_likelihood == pytest.approx(-cost(best) / 2, rel=1e-6)
 
 
 def test_a_segment_that_matches_nothing_costs_e_max_once(rng):
-    near, lines, kappa, W, valid = random_problem(rng)
+    near, lines, apparent_scale, W, valid = random_problem(rng)
     everything = jnp.ones(len(near), bool)
     valid = np.ones_like(valid)
     before = compare_pose(
-        STIFF, *as_arrays(near, lines, kappa, W, valid), SE2.identity(), everything
+        STIFF, *as_arrays(near, lines, apparent_scale, W, valid), SE2.identity(), everything
     )
     assert before.error[0] < STIFF.e_max
     for far in (5.0, 5000.0):
         moved = np.array([near[0] + [far, 0.3], *near[1:]])
         after = compare_pose(
-            STIFF, *as_arrays(moved, lines, kappa, W, valid), SE2.identity(), everything
+            STIFF, *as_arrays(moved, lines, apparent_scale, W, valid), SE2.identity(), everything
         )
         cost = 2 * float(before.log_likelihood - after.log_likelihood)
         assert cost == pytest.approx(STIFF.e_max - float(before.error[0]))
@@ -154,54 +158,54 @@ def test_a_segment_that_matches_nothing_costs_e_max_once(rng):
 
 
 def test_an_empty_map_costs_e_max_for_every_segment_wherever_the_robot_is(rng):
-    near, lines, kappa, W, valid = random_problem(rng)
-    arrays = as_arrays(near, lines, kappa, W, np.zeros_like(valid))
+    near, lines, apparent_scale, W, valid = random_problem(rng)
+    arrays = as_arrays(near, lines, apparent_scale, W, np.zeros_like(valid))
     for T in rng.normal(size=(3, 3)):
         found = compare_pose(STIFF, *arrays, pose(*T), jnp.ones(6, bool))
         assert found.log_likelihood == pytest.approx(-6 * STIFF.e_max / 2)
 
 
 def test_what_is_not_valid_counts_nothing_and_what_may_not_match_costs_the_most(rng):
-    near, lines, kappa, W, valid = random_problem(rng)
+    near, lines, apparent_scale, W, valid = random_problem(rng)
     mask = np.array([True, False, True, True, False, True])
     expected = reference.log_likelihood(
         near[mask],
         mask[mask],
-        as_lists(lines[mask], kappa[mask], W[mask], valid[mask]),
+        as_lists(lines[mask], apparent_scale[mask], W[mask], valid[mask]),
         9.0,
         np.zeros(3),
     )
-    sightings, candidates = as_arrays(near, lines, kappa, W, valid)
-    unused = compare_pose(STIFF, sightings, candidates, SE2.identity(), jnp.asarray(mask))
-    padded = Sightings(
-        sightings.endpoints_foot,
+    measurements, candidates = as_arrays(near, lines, apparent_scale, W, valid)
+    unused = compare_pose(STIFF, measurements, candidates, SE2.identity(), jnp.asarray(mask))
+    padded = Measurements(
+        measurements.endpoints_nadir,
         jnp.asarray(mask),
-        sightings.line,
-        sightings.covariance,
-        sightings.tilt,
+        measurements.line,
+        measurements.covariance,
+        measurements.tilt,
     )
     invalid = compare_pose(STIFF, padded, candidates, SE2.identity(), jnp.ones(6, bool))
     assert invalid.log_likelihood == pytest.approx(expected)
     assert unused.log_likelihood == pytest.approx(expected - 2 * 9.0 / 2)
-    nothing = compare_pose(STIFF, sightings, candidates, SE2.identity(), jnp.zeros(6, bool))
+    nothing = compare_pose(STIFF, measurements, candidates, SE2.identity(), jnp.zeros(6, bool))
     assert nothing.log_likelihood == pytest.approx(-6 * 9.0 / 2)
 
 
 def test_where_nothing_lies_on_the_floor_the_answer_is_known_without_comparing(rng):
-    sightings, candidates = as_arrays(*random_problem(rng))
-    sightings = eqx.tree_at(lambda s: s.valid, sightings, jnp.zeros(6, bool))
-    found = compare_pose(STIFF, sightings, candidates, pose(0.1, 0.2, 0.3), jnp.zeros(6, bool))
-    known = nothing_seen(STIFF, pair(sightings, candidates))
+    measurements, candidates = as_arrays(*random_problem(rng))
+    measurements = eqx.tree_at(lambda s: s.valid, measurements, jnp.zeros(6, bool))
+    found = compare_pose(STIFF, measurements, candidates, pose(0.1, 0.2, 0.3), jnp.zeros(6, bool))
+    known = nothing_seen(STIFF, pair(measurements, candidates))
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
 
 
 def test_the_choice_is_the_candidate_that_costs_least(rng):
-    near, lines, kappa, W, valid = random_problem(rng)
+    near, lines, apparent_scale, W, valid = random_problem(rng)
     valid = np.ones_like(valid)
     found = compare_pose(
-        STIFF, *as_arrays(near, lines, kappa, W, valid), SE2.identity(), jnp.ones(6, bool)
+        STIFF, *as_arrays(near, lines, apparent_scale, W, valid), SE2.identity(), jnp.ones(6, bool)
     )
     for m in range(6):
         errors = [
@@ -212,7 +216,7 @@ def test_the_choice_is_the_candidate_that_costs_least(rng):
         assert found.choice[m] == np.argmin(errors)
 
 
-def test_a_raised_line_moves_by_its_magnification():
+def test_a_off_floor_line_moves_by_its_magnification():
     """Driving 10 cm nearer to a line that seems 1.5 times as far brings its image 15 cm nearer."""
     W = np.broadcast_to(1e4 * np.eye(2), (1, 1, 2, 2))
     arrays = as_arrays(
@@ -223,7 +227,7 @@ def test_a_raised_line_moves_by_its_magnification():
 
 
 def test_the_true_pose_is_the_most_likely(rng):
-    """Exact sightings of a few lines, from a place off the predicted one."""
+    """Exact measurements of a few lines, from a place off the predicted one."""
     true = np.array([0.03, -0.02, 0.04])
     lines = np.array([[[1.0, 0.1]], [[-1.5, 0.0]], [[2.0, 1.5]], [[-0.4, 2.2]]])
     near = []
@@ -246,7 +250,7 @@ def test_mahalanobis_is_the_matrix_product(rng):
     np.testing.assert_allclose(mahalanobis(jnp.asarray(d), jnp.asarray(W)), expected)
 
 
-def test_noise_is_believed_where_matches_disagree_and_never_below_the_model():
+def test_noise_is_taken_where_matches_disagree_and_never_below_the_model():
     sensor = SensorModel(adaptation=0.5)
     noise = lambda before, misfit: float(adapt_noise(sensor, jnp.array(before), jnp.array(misfit)))
     assert noise(1.0, 2.0) == 1

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sofjax.geometry import SE2
-from sofjax.loop_closure import ClosingRules, distribute, find
+from sofjax.loop_closure import ClosingConfig, distribute, find
 
 SIGMA = np.array([0.4, 0.4, 0.03])
-RULES = ClosingRules()
+RULES = ClosingConfig()
 
 
 def blocks(period, count, irregular=0.0, seed=4):

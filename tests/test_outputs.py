@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 from test_cli import make_drive
 
-from sofjax.cli import main, outputs, report, stopping
+from sofjax.cli import main, stopping
 from sofjax.cli.run import views
-from sofjax.cli.tally import Closed
 from sofjax.io.camera_file import read_camera, write_camera
 from sofjax.io.drive import read_drive
 from sofjax.io.errors import InputError
@@ -28,6 +27,8 @@ from sofjax.io.map_file import read_map
 from sofjax.io.settings import read_toml
 from sofjax.io.text import write_atomically
 from sofjax.io.trajectory import Trajectory, TrajectoryWriter, read_trajectory
+from sofjax.pipeline import run_folder
+from sofjax.pipeline.run_log import Closed
 
 SMALL = ("--particles", "50")
 
@@ -76,9 +77,9 @@ def check_readable(folder):
                 of_nothing = not len(read_map(folder / "map.geojson")[0])
                 assert (folder / told["of"]).exists() or of_nothing
             case "map.png":
-                assert outputs.check_figure(path) is None
+                assert run_folder.check_figure(path) is None
             case name:
-                assert name == outputs.MARKER or name.endswith(".sofjax-part")
+                assert name == run_folder.MARKER or name.endswith(".sofjax-part")
 
 
 # What is the user's
@@ -86,7 +87,7 @@ def check_readable(folder):
 
 def test_no_command_touches_a_file_that_it_did_not_write(drive, tmp_path, monkeypatch, capfd):
     """A folder with a file of the user's by every name that sofjax writes."""
-    names = [*outputs.OF_A_RUN, outputs.MARKER, "camera.png", "images.png", "index.html"]
+    names = [*run_folder.OF_A_RUN, run_folder.MARKER, "camera.png", "images.png", "index.html"]
     names += ["rgb.txt", "odometry.txt", "groundtruth.txt", "floor_segments.csv"]
     names += [f".{name}.part" for name in names] + [".sofjax-probe", "runs/short-inspect.png"]
     names += [".new.partial/mine", "rgb/000000.jpg", "drive/camera.yaml", "run/map.png"]
@@ -132,17 +133,20 @@ def test_a_drive_is_never_written_into(drive, tmp_path, capfd):
     assert not (drive / "rgb" / "out").exists()
 
 
-@pytest.mark.parametrize("name", [*outputs.OF_A_RUN, outputs.MARKER])
+@pytest.mark.parametrize("name", [*run_folder.OF_A_RUN, run_folder.MARKER])
 def test_a_run_names_the_file_that_is_not_its_own(name, tmp_path):
     (tmp_path / name).write_text("mine")
-    with pytest.raises(InputError, match=name), outputs.run_folder(tmp_path, "", Path("nowhere")):
+    with (
+        pytest.raises(InputError, match=name),
+        run_folder.run_folder(tmp_path, "", Path("nowhere")),
+    ):
         pass
     assert content(tmp_path) == {name: b"mine"}
 
 
 def write_run(folder, *names):
     """What a run does to its folder."""
-    with outputs.run_folder(folder, "", Path("nowhere")):
+    with run_folder.run_folder(folder, "", Path("nowhere")):
         for name in names:
             (folder / name).write_text("a run's")
 
@@ -151,7 +155,7 @@ def test_what_a_run_has_written_a_later_one_replaces(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     write_run(tmp_path, "map.geojson", "report.json", "camera.yaml")
     write_run(tmp_path, "config.toml")
-    assert set(content(tmp_path)) == {"notes.txt", "config.toml", outputs.MARKER}
+    assert set(content(tmp_path)) == {"notes.txt", "config.toml", run_folder.MARKER}
 
 
 def test_what_the_user_has_changed_since_is_the_users(tmp_path):
@@ -177,14 +181,14 @@ def test_a_folder_of_a_run_before_there_were_markers(tmp_path):
         write_run(tmp_path)
     (tmp_path / "camera.yaml").unlink()
     write_run(tmp_path)
-    assert set(content(tmp_path)) == {outputs.MARKER}
+    assert set(content(tmp_path)) == {run_folder.MARKER}
 
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from sofjax.cli import outputs
-with outputs.run_folder(Path(sys.argv[1]), "", Path("nowhere")) as folder:
+from sofjax.pipeline import run_folder
+with run_folder.run_folder(Path(sys.argv[1]), "", Path("nowhere")) as folder:
     (folder / "map.png").write_text("a part")
     (folder / ".report.json.0123abcd.sofjax-part").write_text("a part")
     print("in it", flush=True)
@@ -205,14 +209,14 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path):
         assert content(tmp_path) == before
         held.kill()
     write_run(tmp_path)
-    assert set(content(tmp_path)) == {outputs.MARKER}
+    assert set(content(tmp_path)) == {run_folder.MARKER}
 
 
 def test_runs_that_begin_in_one_second_get_folders_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with (
-        outputs.run_folder(None, "a", Path("nowhere")) as first,
-        outputs.run_folder(None, "a", Path("nowhere")) as second,
+        run_folder.run_folder(None, "a", Path("nowhere")) as first,
+        run_folder.run_folder(None, "a", Path("nowhere")) as second,
     ):
         assert first != second
 
@@ -220,19 +224,19 @@ def test_runs_that_begin_in_one_second_get_folders_of_their_own(tmp_path, monkey
 def test_a_camera_file_and_a_figure_of_sofjax_may_be_replaced(drive, tmp_path):
     camera, figure = tmp_path / "camera.yaml", tmp_path / "camera.png"
     write_camera(camera, read_camera(drive / "camera.yaml"))
-    outputs.check_camera(camera)
+    run_folder.check_camera(camera)
     camera.write_text("# the robot's\n" + camera.read_text())
-    outputs.check_camera(camera)  # a comment above does not hide whose it is
+    run_folder.check_camera(camera)  # a comment above does not hide whose it is
     for path in (camera, tmp_path / "new.png"):
         path.write_text("image_width: 320")
         with pytest.raises(InputError, match="is there already"):
-            outputs.check_camera(path)
-    from sofjax.viewer.sheet import new_figure, save
+            run_folder.check_camera(path)
+    from sofjax.viewer.style import new_figure, save
 
     save(new_figure((1.0, 1.0))[0], figure)
-    outputs.check_figure(figure)
+    run_folder.check_figure(figure)
     with pytest.raises(InputError, match="is no camera file"):
-        outputs.check_camera(figure)
+        run_folder.check_camera(figure)
 
 
 # Full disks
@@ -251,24 +255,24 @@ def room(size):
 
 def test_a_row_without_room_is_cut_off_and_the_file_named(tmp_path):
     path = tmp_path / "t.txt"
-    with TrajectoryWriter(path) as writer, room(300), pytest.raises(OSError) as raised:
+    with TrajectoryWriter(path) as writer, room(300), pytest.raises(OSError) as off_floor:
         for i in range(9):
             writer.write(float(i), np.zeros(2), 0.0)
-    assert raised.value.filename == str(path)
+    assert off_floor.value.filename == str(path)
     assert len(read_trajectory(path).stamps) == i > 1
     assert path.read_bytes().endswith(b"\n")
     if Path("/dev/full").exists():
-        with TrajectoryWriter(Path("/dev/full")) as writer, pytest.raises(OSError) as raised:
+        with TrajectoryWriter(Path("/dev/full")) as writer, pytest.raises(OSError) as off_floor:
             writer.write(0.0, np.zeros(2), 0.0)
-        assert raised.value.filename == "/dev/full" and raised.value.errno == errno.ENOSPC
+        assert off_floor.value.filename == "/dev/full" and off_floor.value.errno == errno.ENOSPC
 
 
 def test_a_file_without_room_stays_as_it_was_and_is_named(tmp_path):
     path = tmp_path / "a"
     write_atomically(path, "old")
-    with room(300), pytest.raises(OSError) as raised:
+    with room(300), pytest.raises(OSError) as off_floor:
         write_atomically(path, "new" * 200)
-    assert raised.value.filename == str(path)
+    assert off_floor.value.filename == str(path)
     assert content(tmp_path) == {"a": b"old"}
 
 
@@ -356,7 +360,7 @@ def test_a_signal_while_solving_leaves_what_was_driven(drive, tmp_path, monkeypa
         at_that_time.update(content(tmp_path))
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("sofjax.cli.closing.close", close)
+    monkeypatch.setattr("sofjax.pipeline.finalize.close", close)
     assert command("run", drive, "--out", tmp_path, *SMALL) == 130
     check_readable(tmp_path)
     assert "interrupted while solving" in capfd.readouterr().out
@@ -381,10 +385,10 @@ def test_a_run_killed_between_two_files_can_still_be_evaluated(
     """What was solved is 90 degrees off what was driven: the map fits one of the two alone."""
     solved = []
 
-    def close(drive, settings, tally, state, driven):
+    def close(drive, settings, run_log, state, driven):
         solved.append(None)
         turned = driven.endpoints_world[..., ::-1] * np.array([-1.0, 1.0])
-        path, turn = tally.trajectory, np.array([[0.0, -1.0], [1.0, 0.0]])
+        path, turn = run_log.trajectory, np.array([[0.0, -1.0], [1.0, 0.0]])
         path = Trajectory(path.stamps, path.xy @ turn.T, path.yaw + np.pi / 2)
         report = {"lines": 1, "accepted": 0, "refused": 0}
         none = np.zeros((0, 2)), np.zeros((0, 2, 2))
@@ -399,7 +403,7 @@ def test_a_run_killed_between_two_files_can_still_be_evaluated(
 
         return wrapped
 
-    monkeypatch.setattr("sofjax.cli.closing.close", close)
+    monkeypatch.setattr("sofjax.pipeline.finalize.close", close)
     for where, name in (
         (report, "write_trajectory"),
         (report, "write_map"),

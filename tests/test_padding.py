@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sofjax.padding import half_if_enough, in_any_run
+from sofjax._pytree import half_if_enough, in_any_run
 
 
 def sum_of_squares(there, values):

@@ -12,7 +12,8 @@ import pytest
 import reference
 from conftest import jit_quickly
 
-from sofjax.association import Association, association_error
+from sofjax.extraction.association import Association, association_error
+from sofjax.extraction.sof import extract
 from sofjax.geometry import (
     SE2,
     Mount,
@@ -26,8 +27,7 @@ from sofjax.geometry import (
     transfer_line,
     two_view_homography,
 )
-from sofjax.presets import DEFAULT, PAPER
-from sofjax.sof import extract
+from sofjax.slam.presets import DEFAULT, PAPER
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -97,13 +97,13 @@ def test_eq_3_two_views_are_two_planes_through_the_line(camera, tilted):
 
 
 def test_eqs_4_and_5_the_first_camera_is_the_origin(camera, tilted):
-    """R̄ and t̄ take the first camera's foot into the second's."""
+    """R̄ and t̄ take the first camera's nadir into the second's."""
     motion = robot(0.4, 0.1, 0.2)
-    foot = np.array([0.1, 0.0])
-    X = np.array([2.0, 0.5])  # on the floor, in the axes of the robot, from the first foot
-    R, t = reference.rotation("z", -0.2)[:2, :2], motion.inverse().apply(jnp.asarray(foot)) - foot
-    second_foot = motion.apply(jnp.asarray(foot))
-    expected = R @ (X + foot - second_foot)
+    nadir = np.array([0.1, 0.0])
+    X = np.array([2.0, 0.5])  # on the floor, in the axes of the robot, from the first nadir
+    R, t = reference.rotation("z", -0.2)[:2, :2], motion.inverse().apply(jnp.asarray(nadir)) - nadir
+    second_nadir = motion.apply(jnp.asarray(nadir))
+    expected = R @ (X + nadir - second_nadir)
     np.testing.assert_allclose(R @ X + t, expected, atol=1e-12)
 
 

@@ -9,10 +9,10 @@ from sofjax.geometry import SE2
 from sofjax.motion import OdometerBias
 from sofjax.particles import (
     Particles,
-    draw_across,
     effective_size,
     mean_pose,
     pose_covariance,
+    resample_observable,
     systematic,
     winner,
 )
@@ -32,7 +32,7 @@ def cloud(xy, yaw, log_weight):
 
 
 def test_resampling_worked_by_hand():
-    """Weights 1/2, 1/4, 1/4, teeth a quarter apart: twice, once, once, wherever they begin."""
+    """Weights 1/2, 1/4, 1/4, offsets a quarter apart: twice, once, once, wherever they begin."""
     for key in KEYS:
         np.testing.assert_array_equal(
             systematic(jax.random.uniform(key), log(2, 1, 1, 1e-30)), [0, 0, 1, 2]
@@ -67,8 +67,8 @@ def test_resampling_is_a_comb_on_the_cumulative_weights(rng):
     weights = rng.random(16)
     cumulative = np.cumsum(weights / weights.sum())
     for key in KEYS[:5]:
-        teeth = (float(jax.random.uniform(key)) + np.arange(16)) / 16
-        expected = [min(int(np.sum(cumulative < tooth)), 15) for tooth in teeth]
+        offsets = (float(jax.random.uniform(key)) + np.arange(16)) / 16
+        expected = [min(int(np.sum(cumulative < offset)), 15) for offset in offsets]
         np.testing.assert_array_equal(systematic(jax.random.uniform(key), log(*weights)), expected)
 
 
@@ -83,8 +83,8 @@ def test_the_scale_of_the_weights_does_not_matter():
 
 def test_resampling_is_unbiased():
     weights = np.array([0.5, 0.3, 0.15, 0.05])
-    teeth = jax.random.uniform(jax.random.key(0), (4000,))
-    drawn = jax.vmap(systematic, (0, None))(teeth, log(*weights))
+    offsets = jax.random.uniform(jax.random.key(0), (4000,))
+    drawn = jax.vmap(systematic, (0, None))(offsets, log(*weights))
     share = np.bincount(np.asarray(drawn).ravel(), minlength=4) / drawn.size
     np.testing.assert_allclose(share, weights, atol=0.01)
 
@@ -162,7 +162,7 @@ def test_what_was_not_seen_stays_each_particle_s_own(rng, x64):
     for key in KEYS:
         _, across, yaw = places(particles)
         log_likelihood = jnp.asarray(-0.5 * ((across - 0.002) / 0.01) ** 2)
-        drawn = draw_across(
+        drawn = resample_observable(
             jax.random.uniform(key, (2,)),
             particles,
             particles.T_world_robot,
@@ -181,7 +181,7 @@ def test_what_was_seen_is_drawn_by_its_likelihood_and_teaches_the_errors_in_turn
     """Gauss: the yaw's posterior is that of Bayes, and the curvature follows as Kalman's would."""
     particles, (_, _, yaw) = corridor_cloud(rng, 20_000)
     log_likelihood = jnp.asarray(-0.5 * ((yaw - 0.003) / 0.003) ** 2)
-    drawn = draw_across(
+    drawn = resample_observable(
         jnp.array(TEETH), particles, particles.T_world_robot, log_likelihood, jnp.array(0.6)
     )
     gain = 0.004**2 / (0.004**2 + 0.003**2)
@@ -200,7 +200,7 @@ def test_of_what_was_tried_only_what_was_seen_is_taken(rng, x64):
     T = particles.T_world_robot
     tried = SE2(T.xy.at[7].add(5.0), T.yaw.at[7].add(0.2))  # one slipped, and alone is right
     log_likelihood = jnp.full(200, -1000.0).at[7].set(0)
-    drawn = draw_across(jnp.array(TEETH), particles, tried, log_likelihood, jnp.array(0.6))
+    drawn = resample_observable(jnp.array(TEETH), particles, tried, log_likelihood, jnp.array(0.6))
     c, s = np.cos(0.6), np.sin(0.6)
     np.testing.assert_allclose(places(drawn)[0], along, atol=1e-9)
     np.testing.assert_allclose(places(drawn)[1], across[7] + 5 * (c - s), atol=1e-9)
@@ -211,7 +211,7 @@ def test_weights_from_before_are_those_of_whole_particles(rng, x64):
     particles, (along, across, *_) = corridor_cloud(rng, 100)
     weights = jnp.where(jnp.arange(100) < 25, jnp.log(0.04), -1e3)
     particles = Particles(particles.T_world_robot, particles.bias, weights)
-    drawn = draw_across(
+    drawn = resample_observable(
         jnp.array(TEETH), particles, particles.T_world_robot, jnp.zeros(100), jnp.array(0.6)
     )
     np.testing.assert_allclose(np.unique(places(drawn)[0].round(9)), np.sort(along[:25].round(9)))
@@ -221,7 +221,7 @@ def test_weights_from_before_are_those_of_whole_particles(rng, x64):
 
 def test_a_cloud_in_one_point_stays_there(x64):
     particles = cloud(np.tile([3.0, 4.0], (8, 1)), np.full(8, 0.1), jnp.full(8, -jnp.log(8)))
-    drawn = draw_across(
+    drawn = resample_observable(
         jnp.array(TEETH), particles, particles.T_world_robot, jnp.zeros(8), jnp.array(0.1)
     )
     np.testing.assert_allclose(drawn.T_world_robot.xy, particles.T_world_robot.xy)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import equinox as eqx
 
-from sofjax import presets
 from sofjax.cli.main import _parser
-from sofjax.cli.settings import RunSettings
 from sofjax.io.camera_file import read_camera
 from sofjax.io.settings import to_dict
+from sofjax.pipeline.settings import RunSettings
+from sofjax.slam import presets
 from sofjax.vision import FrontendSettings
 
 ROOT = Path(__file__).parent.parent

@@ -12,27 +12,27 @@ from conftest import jit_quickly
 
 from sofjax.geometry import SE2, Mount, PolarLine, Segments
 from sofjax.geometry.lines import polar_through
+from sofjax.likelihood.measurements import Measurements, SensorModel
 from sofjax.segment_map import (
-    MapRules,
+    MapConfig,
     SegmentMap,
-    appear,
-    believed,
+    candidate_associations,
     empty_map,
     in_view,
     integrate,
-    is_raised,
+    is_off_floor,
     nearby,
-    propose,
+    posterior_given_class,
+    predict_measurement,
 )
-from sofjax.sightings import SensorModel, Sightings
 
 pytestmark = pytest.mark.usefixtures("x64")
 
 K, M = 8, 4
-KALMAN = MapRules(capacity=K, rho_drift=0.0, theta_drift=0.0)
+KALMAN = MapConfig(capacity=K, rho_drift=0.0, theta_drift=0.0)
 GAMMA = dataclasses.replace(KALMAN, rule="gamma", classify=False)
 STIFF = SensorModel(tilt_sigma=0.0)
-grow, proposals = jit_quickly(integrate), jit_quickly(propose)
+grow, proposals = jit_quickly(integrate), jit_quickly(candidate_associations)
 
 
 def everything(L):
@@ -44,13 +44,13 @@ def pose(x=0.0, y=0.0, yaw=0.0):
     return SE2(jnp.array([x, y], float), jnp.array(yaw, float))
 
 
-def sightings_of(*ends, sigma=0.01):
-    """Sightings in the frame of the foot, padded to M; (rho, theta) with the same sigma each."""
+def measurements_of(*ends, sigma=0.01):
+    """Measurements in the nadir frame, padded to M; (rho, theta) with the same sigma each."""
     padded = np.zeros((M, 2, 2))
     padded[: len(ends)] = np.asarray(ends).reshape(-1, 2, 2)
     padded = jnp.asarray(padded)
-    return Sightings(
-        endpoints_foot=padded,
+    return Measurements(
+        endpoints_nadir=padded,
         valid=jnp.arange(M) < len(ends),
         line=jax.vmap(polar_through)(padded),
         covariance=jnp.broadcast_to(sigma**2 * jnp.eye(2), (M, 2, 2)),
@@ -63,11 +63,11 @@ def see(segment_map, *ends, at=None, slots=None, rules=GAMMA, sigma=0.01, view=(
     at = pose() if at is None else at
     known = jnp.arange(M) < len(slots or ())
     slot = jnp.array([*(slots or ()), *[0] * M], int)[:M]
-    sightings = sightings_of(*ends, sigma=sigma)
-    new = sightings.valid & ~known
+    measurements = measurements_of(*ends, sigma=sigma)
+    new = measurements.valid & ~known
     shown = jnp.zeros(K, bool).at[jnp.array(view, int)].set(True)
     return grow(
-        rules, STIFF, segment_map, jnp.arange(K), sightings, slot, everything(K), known, new,
+        rules, STIFF, segment_map, jnp.arange(K), measurements, slot, everything(K), known, new,
         jnp.zeros(2), shown, at,
     )[:2]  # fmt: skip
 
@@ -148,7 +148,10 @@ def test_what_finds_no_place_is_counted_and_changes_nothing():
 
 
 def test_where_new_lines_begin_is_told():
-    m, s = seen(empty_map(GAMMA), across(1.0)), sightings_of(across(1.0), across(2.0), across(3.0))
+    m, s = (
+        seen(empty_map(GAMMA), across(1.0)),
+        measurements_of(across(1.0), across(2.0), across(3.0)),
+    )
     known = jnp.arange(M) < 1
     after, _, slot = grow(
         GAMMA, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), everything(K), known,
@@ -187,7 +190,7 @@ def test_eq_14_acts_in_the_polar_form_of_the_moment():
     """Seen 20 cm too far from a turned robot: the line moves by half of that, there."""
     m = seen(empty_map(GAMMA), across(1.0, 0, 6))
     at = pose(3, 0.5, 0.2)
-    error = np.array([-np.sin(-0.2), np.cos(-0.2)]) * 0.2  # across the line, in the foot's axes
+    error = np.array([-np.sin(-0.2), np.cos(-0.2)]) * 0.2  # across the line, in the nadir's axes
     ends = np.asarray(at.inverse().apply(jnp.array(across(1.0, 2, 5)))) + error
     m = seen(m, ends, at=at, slots=[0])
     np.testing.assert_allclose(ends_of(m)[:, 1], 1.1, atol=1e-9)
@@ -203,11 +206,11 @@ def test_the_side_a_segment_is_named_from_does_not_matter():
 
 
 def named_both_ways(correlation=0.8):
-    """One sighting with correlated errors of rho and theta, by either of its names."""
+    """One measurement with correlated errors of rho and theta, by either of its names."""
     for ends, sign in ((across(1.2), 1), (across(1.2)[::-1], -1)):
         covariance = jnp.array([[1.0, sign * correlation], [sign * correlation, 1.0]]) * 1e-2
         yield dataclasses.replace(
-            sightings_of(ends), covariance=jnp.broadcast_to(covariance, (M, 2, 2))
+            measurements_of(ends), covariance=jnp.broadcast_to(covariance, (M, 2, 2))
         )
 
 
@@ -234,7 +237,7 @@ def test_correlated_errors_turn_with_the_name_when_a_line_is_updated():
     np.testing.assert_allclose(there.covariance[0], back.covariance[0], atol=1e-12)
 
 
-def test_pieces_of_one_line_count_as_one_sighting():
+def test_pieces_of_one_line_count_as_one_measurement():
     m = seen(empty_map(GAMMA), across(1.0, 0, 4))
     after = seen(m, across(1.2, 0, 1), across(1.4, 3, 4), slots=[0, 0])
     assert after.updates[0] == 2
@@ -297,7 +300,7 @@ def test_a_segment_longer_than_L_rests_and_may_then_grow_again():
 
 
 def test_the_paper_rests_at_twice_R():
-    assert MapRules().length == 2 * MapRules().range == 10
+    assert MapConfig().length == 2 * MapConfig().range == 10
 
 
 # Doubled lines
@@ -340,14 +343,14 @@ def test_lines_that_cross_stay_two():
     assert m.valid.sum() == 2
 
 
-def test_a_raised_line_does_not_join_the_floor_line_below_it():
+def test_a_off_floor_line_does_not_join_the_floor_line_below_it():
     m, ends = doubled(KALMAN)
-    raised = dataclasses.replace(
+    off_floor = dataclasses.replace(
         m,
         line=m.line.at[0, 2].set(1.2),
         covariance=m.covariance.at[0, 2].set(0).at[0, :, 2].set(0).at[0, 2, 2].set(1e-4),
     )
-    assert seen(raised, ends, slots=[1], rules=KALMAN).valid.sum() == 2
+    assert seen(off_floor, ends, slots=[1], rules=KALMAN).valid.sum() == 2
 
 
 def test_the_older_line_does_not_join_the_younger():
@@ -405,10 +408,10 @@ def test_an_image_without_segments_leaves_the_map_bit_identical(rules):
 # Heights
 
 
-def raised_view(T, y, z, x0=0.0, x1=3.0, h=0.6):
-    """Ends on the floor of a line at height z as they appear from a foot."""
-    kappa = h / (h - z)
-    return kappa * np.asarray(T.inverse().apply(jnp.array(across(y, x0, x1))))
+def off_floor_view(T, y, z, x0=0.0, x1=3.0, h=0.6):
+    """Ends on the floor of a line at height z as they appear from a nadir."""
+    apparent_scale = h / (h - z)
+    return apparent_scale * np.asarray(T.inverse().apply(jnp.array(across(y, x0, x1))))
 
 
 PATH = [(0.1 * i, 0.08 * i, 0.05 * i) for i in range(9)]
@@ -418,7 +421,7 @@ def drive_past(z, rules=KALMAN, sigma=0.005):
     """A line 1 m to the left, seen ever nearer."""
     m = empty_map(rules)
     for i, T in enumerate(pose(*where) for where in PATH):
-        ends = raised_view(T, 1.0, z)
+        ends = off_floor_view(T, 1.0, z)
         m = seen(m, ends, at=T, slots=[0] if i else None, rules=rules, sigma=sigma)
     return m
 
@@ -426,25 +429,25 @@ def drive_past(z, rules=KALMAN, sigma=0.005):
 @pytest.mark.parametrize("z", [0.0, 0.1, -0.4])
 def test_the_height_of_a_line_is_found_from_all_its_views(z):
     m = drive_past(z)
-    kappa = 0.6 / (0.6 - z)
+    apparent_scale = 0.6 / (0.6 - z)
     sigma = float(np.sqrt(m.covariance[0, 2, 2]))
-    assert abs(m.line[0, 2] - kappa) < 1e-3
+    assert abs(m.line[0, 2] - apparent_scale) < 1e-3
     assert sigma < 0.05
-    assert bool(is_raised(KALMAN, m.line[0], m.covariance[0])) == (z != 0)
+    assert bool(is_off_floor(KALMAN, m.line[0], m.covariance[0])) == (z != 0)
     # and the segment lies where the line is, not where it appears from anywhere
     np.testing.assert_allclose(ends_of(m)[:, 1], 1.0, atol=2e-3)
 
 
-def test_a_raised_line_grows_to_where_it_ends_and_not_to_where_it_appears_to():
+def test_a_off_floor_line_grows_to_where_it_ends_and_not_to_where_it_appears_to():
     m, T = drive_past(0.1), pose(*PATH[-1])
-    apparent = raised_view(T, 1.0, 0.1, 1.0, 4.2)
+    apparent = off_floor_view(T, 1.0, 0.1, 1.0, 4.2)
     m = seen(m, apparent, at=T, slots=[0], rules=KALMAN, sigma=0.005)
     assert T.apply(jnp.asarray(apparent))[1, 0] > 4.8
     assert ends_of(m)[:, 0].max() == pytest.approx(4.2, abs=0.01)
 
 
 @pytest.mark.parametrize(
-    ("kappa", "sigma", "expected"),
+    ("apparent_scale", "sigma", "expected"),
     [
         (1.2, 0.05, True),
         (1.2, 0.07, False),  # less than three sigmas from 1
@@ -454,17 +457,20 @@ def test_a_raised_line_grows_to_where_it_ends_and_not_to_where_it_appears_to():
         (1.0, 1e-9, False),
     ],
 )
-def test_a_line_is_raised_if_all_its_views_say_so(kappa, sigma, expected):
-    line, covariance = jnp.array([1.0, 0.0, kappa]), jnp.diag(jnp.array([1.0, 1.0, sigma**2]))
-    assert bool(is_raised(KALMAN, line, covariance)) == expected
-    assert not is_raised(GAMMA, line, covariance)  # the paper knows no heights
+def test_a_line_is_off_floor_if_all_its_views_say_so(apparent_scale, sigma, expected):
+    line, covariance = (
+        jnp.array([1.0, 0.0, apparent_scale]),
+        jnp.diag(jnp.array([1.0, 1.0, sigma**2])),
+    )
+    assert bool(is_off_floor(KALMAN, line, covariance)) == expected
+    assert not is_off_floor(GAMMA, line, covariance)  # the paper knows no heights
 
 
 def test_a_line_taken_for_floor_is_conditioned_on_its_height(rng):
-    """As the regression of (rho, theta) on kappa says, of many draws."""
+    """As the regression of (rho, theta) on the apparent scale says, of many draws."""
     root = np.array([[0.1, 0, 0], [0.02, 0.05, 0], [0.03, -0.01, 0.04]])
     line, covariance = np.array([1.0, 0.2, 1.02]), root @ root.T
-    found, left = believed(KALMAN, jnp.asarray(line), jnp.asarray(covariance))
+    found, left = posterior_given_class(KALMAN, jnp.asarray(line), jnp.asarray(covariance))
     x = rng.multivariate_normal(line, covariance, size=200_000)
     A = np.column_stack([x[:, 2] - 1, np.ones(len(x))])
     fit, *_ = np.linalg.lstsq(A, x[:, :2])
@@ -474,9 +480,9 @@ def test_a_line_taken_for_floor_is_conditioned_on_its_height(rng):
     np.testing.assert_allclose(left[2], 0, atol=1e-12)
 
 
-def test_a_raised_line_is_believed_as_it_is():
+def test_a_off_floor_line_is_taken_as_it_is():
     line, covariance = jnp.array([1.0, 0.2, 1.3]), jnp.diag(jnp.array([0.1, 0.1, 1e-4]))
-    assert_bitwise_equal(believed(KALMAN, line, covariance), (line, covariance))
+    assert_bitwise_equal(posterior_given_class(KALMAN, line, covariance), (line, covariance))
 
 
 @pytest.mark.parametrize("z", [0.0, 0.15, -0.3])
@@ -493,16 +499,18 @@ def test_a_line_appears_from_elsewhere_as_the_camera_will_see_it(camera, mounts,
             pixels, _ = reference.project(camera.K, mount, where, true)
             H_F = reference.floor_homography(camera.K, mount, where)
             X = np.column_stack([pixels, np.ones(2)]) @ np.linalg.inv(H_F).T
-            foot = pose(*where) @ mount.T_robot_foot
-            ends = foot.inverse().apply(jnp.asarray(X[:, :2] / X[:, 2:]))
-            views.append((foot, polar_through(ends)))
+            nadir = pose(*where) @ mount.T_robot_nadir
+            ends = nadir.inverse().apply(jnp.asarray(X[:, :2] / X[:, 2:]))
+            views.append((nadir, polar_through(ends)))
         (anchor, line), (there, expected) = views
-        kappa = float(mount.height) / (float(mount.height) - z)
-        found, H = appear(jnp.array([line.rho, line.theta, kappa]), anchor, there)
+        apparent_scale = float(mount.height) / (float(mount.height) - z)
+        found, H = predict_measurement(
+            jnp.array([line.rho, line.theta, apparent_scale]), anchor, there
+        )
         d = reference.polar_difference((found[0], found[1]), (expected.rho, expected.theta))
         np.testing.assert_allclose(d, 0, atol=1e-7)
-        by_difference = jax.jacfwd(lambda a, b, c: appear(a, b, c)[0][:2])(
-            jnp.array([line.rho, line.theta, kappa]), anchor, there
+        by_difference = jax.jacfwd(lambda a, b, c: predict_measurement(a, b, c)[0][:2])(
+            jnp.array([line.rho, line.theta, apparent_scale]), anchor, there
         )
         np.testing.assert_allclose(H, by_difference, atol=1e-9)
         checked += 1
@@ -514,7 +522,7 @@ def test_the_kalman_rule_is_a_plain_extended_kalman_filter(rng):
     m, x, P = empty_map(rules), None, None
     R = np.diag([0.005**2 + 0.003**2, 0.005**2 + 0.002**2])
     for i, T in enumerate(pose(*where) for where in PATH):
-        ends = raised_view(T, 1.0, 0.05) + 0.003 * rng.normal(size=(2, 2))
+        ends = off_floor_view(T, 1.0, 0.05) + 0.003 * rng.normal(size=(2, 2))
         rho, theta = reference.polar_through(*ends)
         m = seen(m, ends, at=T, slots=[0] if i else None, rules=rules, sigma=0.005)
         if i == 0:
@@ -531,7 +539,7 @@ def test_the_kalman_rule_is_a_plain_extended_kalman_filter(rng):
         np.testing.assert_allclose(m.covariance[0], P, rtol=1e-6, atol=1e-12)
 
 
-def test_two_pieces_of_one_line_inform_as_two_sightings_would():
+def test_two_pieces_of_one_line_inform_as_two_measurements_would():
     m = seen(empty_map(KALMAN), across(1.0, 0, 4), rules=KALMAN)
     pieces = across(1.01, 0, 1), across(0.98, 3, 4)
     together = seen(m, *pieces, slots=[0, 0], rules=KALMAN)
@@ -542,16 +550,16 @@ def test_two_pieces_of_one_line_inform_as_two_sightings_would():
     np.testing.assert_allclose(together.covariance[0], one_by_one.covariance[0], rtol=1e-6)
 
 
-def test_a_wobble_is_taken_out_of_what_is_integrated():
-    sightings = dataclasses.replace(
-        sightings_of(across(1.03)),
+def test_a_jitter_is_taken_out_of_what_is_integrated():
+    measurements = dataclasses.replace(
+        measurements_of(across(1.03)),
         tilt=jnp.broadcast_to(jnp.array([[3.0, 0.0], [0.0, 0.0]]), (M, 2, 2)),
     )
     m = seen(empty_map(GAMMA), across(1.0))
     known = jnp.arange(M) < 1
     after, *_ = grow(
-        GAMMA, STIFF, m, jnp.arange(K), sightings, jnp.zeros(M, int), everything(K), known,
-        ~known & sightings.valid, jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
+        GAMMA, STIFF, m, jnp.arange(K), measurements, jnp.zeros(M, int), everything(K), known,
+        ~known & measurements.valid, jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
     )  # fmt: skip
     assert offset(after) == pytest.approx(1.0)
 
@@ -582,27 +590,27 @@ def test_the_candidates_are_the_nearest_lines_of_a_loop_over_all_pairs(propagate
     sensor = SensorModel(propagate=propagate, tilt_sigma=0.05)
     for _ in range(3):
         m = random_map(rng)
-        sightings = dataclasses.replace(
-            sightings_of(*(rng.normal(size=(M, 2, 2)))),
+        measurements = dataclasses.replace(
+            measurements_of(*(rng.normal(size=(M, 2, 2)))),
             tilt=jnp.asarray(rng.normal(size=(M, 2, 2))),
         )
         at = pose(*rng.normal(size=3) * 0.3)
-        candidates, slot, nearest = proposals(rules, sensor, m, sightings, at)
+        candidates, slot, nearest = proposals(rules, sensor, m, measurements, at)
         for i in range(M):
             errors, kept = np.full(K, np.inf), {}
             for k in range(K):
                 anchor = SE2(m.anchor.xy[k], m.anchor.yaw[k])
-                line, P = believed(rules, m.line[k], m.covariance[k])
-                seen_line, H = appear(line, anchor, at)
-                S = np.asarray(sightings.covariance[i]) + np.diag([0.01**2, 0.02**2])
-                opposite = np.cos(sightings.line.theta[i] - seen_line[1]) < 0
+                line, P = posterior_given_class(rules, m.line[k], m.covariance[k])
+                seen_line, H = predict_measurement(line, anchor, at)
+                S = np.asarray(measurements.covariance[i]) + np.diag([0.01**2, 0.02**2])
+                opposite = np.cos(measurements.line.theta[i] - seen_line[1]) < 0
                 by_its_name = np.diag([-1, 1]) if opposite else np.eye(2)
                 S = S + (by_its_name @ np.asarray(H @ P @ H.T) @ by_its_name if propagate else 0)
-                J = np.asarray(sightings.tilt[i])
+                J = np.asarray(measurements.tilt[i])
                 S_tilt = S + 0.05**2 * J @ J.T
                 extent = float(seen_line[2]) * at.inverse().apply(m.segments_world.endpoints[k])
-                if m.valid[k] and reference.overlap(extent, sightings.endpoints_foot[i]) > -0.3:
-                    line_i = (sightings.line.rho[i], sightings.line.theta[i])
+                if m.valid[k] and reference.overlap(extent, measurements.endpoints_nadir[i]) > -0.3:
+                    line_i = (measurements.line.rho[i], measurements.line.theta[i])
                     d = np.array(reference.polar_difference(line_i, seen_line[:2]))
                     errors[k] = d @ np.linalg.inv(S_tilt) @ d
                     kept[k] = (S, S_tilt, seen_line)
@@ -619,14 +627,14 @@ def test_the_candidates_are_the_nearest_lines_of_a_loop_over_all_pairs(propagate
                 found = (
                     candidates.line.rho[i, j],
                     candidates.line.theta[i, j],
-                    candidates.kappa[i, j],
+                    candidates.apparent_scale[i, j],
                 )
                 np.testing.assert_allclose(found, seen_line, atol=1e-9)
 
 
 def test_an_empty_map_proposes_nothing():
     candidates, _, nearest = proposals(
-        KALMAN, STIFF, empty_map(KALMAN), sightings_of(across(1.0)), pose()
+        KALMAN, STIFF, empty_map(KALMAN), measurements_of(across(1.0)), pose()
     )
     assert not candidates.valid.any()
     np.testing.assert_array_equal(nearest, jnp.inf)
@@ -638,7 +646,7 @@ def test_a_piece_beyond_the_end_of_its_line_is_proposed_up_to_the_gap():
     m = seen(empty_map(KALMAN), across(1.0, 0, 2), rules=KALMAN)
     for x0, expected in ((2.2, True), (2.4, False)):
         candidates, _, nearest = proposals(
-            KALMAN, STIFF, m, sightings_of(across(1.0, x0, 3)), pose()
+            KALMAN, STIFF, m, measurements_of(across(1.0, x0, 3)), pose()
         )
         assert bool(candidates.valid[0, 0]) == expected
         assert bool(np.isfinite(nearest[0])) == expected
@@ -648,18 +656,18 @@ def test_the_lines_nearby_are_all_that_a_loop_finds_within_reach(rng):
     """If they are no more than L; else the nearest, and what is left out within reach is told."""
     m, at = random_map(rng), pose(0.4, -0.3, 1.0)
     distance = []
-    for ends, kappa in zip(m.segments_world.endpoints, m.line[:, 2], strict=True):
+    for ends, apparent_scale in zip(m.segments_world.endpoints, m.line[:, 2], strict=True):
         a, b = np.asarray(ends) - np.asarray(at.xy)
         points = a + np.linspace(0, 1, 100_001)[:, None] * (b - a)
-        distance.append(float(kappa) * np.linalg.norm(points, axis=1).min())
+        distance.append(float(apparent_scale) * np.linalg.norm(points, axis=1).min())
     order = [k for k in np.argsort(distance) if m.valid[k]]
     assert 4 < len(order) < K
     for L in (1, 3, len(order), K):
         reach = 0.5 * (distance[order[3]] + distance[order[4]])  # four of them lie within it
-        slots, hidden = nearby(dataclasses.replace(KALMAN, nearby=L), m, at, jnp.array(reach))
+        slots, truncated = nearby(dataclasses.replace(KALMAN, nearby=L), m, at, jnp.array(reach))
         found = [int(k) for k in slots if k < K]
         assert found == sorted(order[: len(found)]) and len(found) <= L
-        assert hidden == max(0, 4 - len(found))
+        assert truncated == max(0, 4 - len(found))
         assert len(found) == len(order) or L < len(order)
         taken = m.take(slots)
         np.testing.assert_array_equal(taken.valid, np.asarray(slots) < K)
@@ -675,8 +683,8 @@ def test_lines_beyond_those_nearby_only_age():
     np.testing.assert_array_equal(near, [0, 1])
     known = jnp.arange(M) < 1
     after, *_ = jit_quickly(integrate)(
-        rules, STIFF, m, near, sightings_of(across(2.2)), jnp.ones(M, int), everything(len(near)),
-        known, ~known & known, jnp.zeros(2), jnp.zeros(2, bool), pose(),
+        rules, STIFF, m, near, measurements_of(across(2.2)), jnp.ones(M, int),
+        everything(len(near)), known, ~known & known, jnp.zeros(2), jnp.zeros(2, bool), pose(),
     )  # fmt: skip
     np.testing.assert_array_equal(after.updates[:3], [1, 2, 1])
     np.testing.assert_array_equal(
@@ -691,8 +699,8 @@ def test_what_was_seen_too_long_ago_is_not_looked_for():
     m = seen(m, across(1.0), slots=[0])
     for recall, slots in ((0, [0]), (1, [0, 1])):
         rules = dataclasses.replace(GAMMA, recall=recall)
-        near, hidden = nearby(rules, m, pose(), jnp.array(6.0))
-        assert [int(k) for k in near if k < m.updates.shape[0]] == slots and hidden == 0
+        near, truncated = nearby(rules, m, pose(), jnp.array(6.0))
+        assert [int(k) for k in near if k < m.updates.shape[0]] == slots and truncated == 0
 
 
 def test_what_is_in_view_worked_by_hand(camera):

@@ -1,4 +1,4 @@
-"""Sightings: the segments of an image on the floor, with their errors; II.B, III.A."""
+"""Measurements: the segments of an image on the floor, with their errors; II.B, III.A."""
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +8,16 @@ import reference
 from conftest import jit_quickly
 
 from sofjax.geometry import Mount, PolarLine, Segments
-from sofjax.sightings import SensorModel, Sightings, free_direction, sight
+from sofjax.likelihood.measurements import (
+    Measurements,
+    SensorModel,
+    measure,
+    unobservable_direction,
+)
 
 pytestmark = pytest.mark.usefixtures("x64")
 
-see = jit_quickly(sight)
+see = jit_quickly(measure)
 DEPTH = 8.0
 SEGMENTS = np.array(
     [
@@ -39,7 +44,7 @@ def rolled():
 
 
 def floor_lines(camera, mount, ends):
-    """(rho, theta) about the foot of many segments [..., 2, 2] in plain numpy."""
+    """(rho, theta) about the nadir of many segments [..., 2, 2] in plain numpy."""
     inverse = np.linalg.inv(reference.floor_homography(camera.K, mount, (0, 0, 0)))
     X = np.concatenate([ends, np.ones((*ends.shape[:-1], 1))], axis=-1) @ inverse.T
     points = X[..., :2] / X[..., 2:] - [float(mount.x), float(mount.y)]
@@ -50,13 +55,13 @@ def floor_lines(camera, mount, ends):
     )
 
 
-def test_a_sighting_worked_by_hand(camera):
+def test_a_measurement_worked_by_hand(camera):
     # level, 1 m up: a row 54 px below the centre is 5 m away, and a pixel there 5² / 270 m
     level = Mount.create(height=1.0, x=0.2)
     across = segments([[[100.0, 173.5], [200.0, 173.5]]])
     found = see(SensorModel(pixel_sigma=0.5), camera, level, across, DEPTH)
-    np.testing.assert_allclose(found.endpoints_foot[0], [[5, 59.5 / 54], [5, -40.5 / 54]])
-    assert abs(found.line.rho[0]) == pytest.approx(5)  # about the foot, not the axle
+    np.testing.assert_allclose(found.endpoints_nadir[0], [[5, 59.5 / 54], [5, -40.5 / 54]])
+    assert abs(found.line.rho[0]) == pytest.approx(5)  # about the nadir, not the axle
     assert abs(found.line.theta[0]) == pytest.approx(np.pi / 2)
     # rho is at y = 0, between the ends: their noises are weighted by 40.5 and 59.5 per cent
     assert found.covariance[0, 0, 0] == pytest.approx(
@@ -96,15 +101,15 @@ def test_noise_multiplies_the_variance_of_the_pixels(camera, mount):
     np.testing.assert_array_equal(thrice.tilt, once.tilt)
 
 
-def test_a_known_wobble_is_corrected(camera, rolled):
-    """An image taken with the camera tipped by the wobble, put on the floor as if it were not."""
-    wobble = np.array([0.002, -0.003])
+def test_a_known_jitter_is_corrected(camera, rolled):
+    """An image taken with the camera tipped by the jitter, put on the floor as if it were not."""
+    jitter = np.array([0.002, -0.003])
     tipped = Mount.create(
-        height=0.6, pitch=0.26 + wobble[0], x=0.1, y=-0.05, roll=0.05 + wobble[1], yaw=0.1
+        height=0.6, pitch=0.26 + jitter[0], x=0.1, y=-0.05, roll=0.05 + jitter[1], yaw=0.1
     )
     found = see(SensorModel(), camera, rolled, segments(SEGMENTS), DEPTH)
     true = floor_lines(camera, tipped, SEGMENTS)
-    corrected = found.under_tilt(jnp.asarray(wobble))
+    corrected = found.under_tilt(jnp.asarray(jitter))
     before = np.stack([found.line.rho, found.line.theta], 1) - true
     after = np.stack([corrected.rho, corrected.theta], 1) - true
     assert (np.linalg.norm(after, axis=1) < 0.05 * np.linalg.norm(before, axis=1)).all()
@@ -119,14 +124,14 @@ def test_the_paper_has_one_constant_sigma(camera, mount):
     np.testing.assert_array_equal(found.tilt, 0)
 
 
-def test_a_segment_whose_direction_is_hardly_known_is_no_sighting(camera, mount):
+def test_a_segment_whose_direction_is_hardly_known_is_no_measurement(camera, mount):
     short = segments([[[150, 150], [152, 150]], [[50, 150], [250, 150]]])
     found = see(SensorModel(theta_limit=0.2), camera, mount, short, DEPTH)
     np.testing.assert_array_equal(found.valid[:2], [False, True])
 
 
 @pytest.mark.parametrize("propagate", [True, False])
-def test_what_has_no_length_or_lies_above_the_horizon_is_no_sighting(camera, mount, propagate):
+def test_what_has_no_length_or_lies_above_the_horizon_is_no_measurement(camera, mount, propagate):
     ends = [[[150, 150], [150, 150]], [[10, 5], [300, 9]], [[50, 150], [250, 150]]]
     found = see(SensorModel(propagate=propagate), camera, mount, segments(ends), DEPTH)
     np.testing.assert_array_equal(found.valid[:3], [False, False, True])
@@ -134,7 +139,7 @@ def test_what_has_no_length_or_lies_above_the_horizon_is_no_sighting(camera, mou
         assert np.isfinite(leaf).all()
 
 
-def test_padding_is_no_sighting_and_finite(camera, mount):
+def test_padding_is_no_measurement_and_finite(camera, mount):
     for ends in (np.zeros((5, 2, 2)), SEGMENTS):
         found = see(SensorModel(), camera, mount, segments(ends, valid=False), DEPTH)
         assert not found.valid.any()
@@ -147,11 +152,11 @@ def along(*theta, sigma=0.01):
     line = PolarLine(jnp.ones_like(theta), theta)
     covariance = jnp.broadcast_to(jnp.diag(jnp.array([1e-4, sigma**2])), (len(theta), 2, 2))
     none = jnp.zeros_like(covariance)
-    return Sightings(none, theta < 9, line, covariance, none)
+    return Measurements(none, theta < 9, line, covariance, none)
 
 
 def test_lines_that_all_run_one_way_leave_it_free():
-    all_known = lambda s: free_direction(s, s.valid)
+    all_known = lambda s: unobservable_direction(s, s.valid)
     free, parallel = all_known(along(0.3, 0.32, 0.29, 0.3 + np.pi, 0.3 - np.pi))
     assert parallel and np.sin(free - 0.3) == pytest.approx(0, abs=0.01)
     assert not all_known(along(0.3, 0.3, 0.3, 0.5))[1]
@@ -161,8 +166,8 @@ def test_lines_that_all_run_one_way_leave_it_free():
 
 
 def test_what_is_not_known_tells_no_direction():
-    sightings = along(0.3, 0.31, 1.5)
-    assert free_direction(sightings, jnp.array([True, True, False]))[1]
-    assert not free_direction(sightings, jnp.array([True, True, True]))[1]
-    free, parallel = free_direction(sightings, jnp.zeros(3, bool))
+    measurements = along(0.3, 0.31, 1.5)
+    assert unobservable_direction(measurements, jnp.array([True, True, False]))[1]
+    assert not unobservable_direction(measurements, jnp.array([True, True, True]))[1]
+    free, parallel = unobservable_direction(measurements, jnp.zeros(3, bool))
     assert not parallel and np.isfinite(free)

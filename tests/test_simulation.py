@@ -19,11 +19,11 @@ from sofjax.io.camera_file import CameraFile
 from sofjax.io.drive import motions, read_drive
 from sofjax.simulation import (
     WORLDS,
-    Artist,
     Detection,
     Driver,
     Imaging,
     Odometer,
+    Renderer,
     Rig,
     Scene,
     make_world,
@@ -33,10 +33,10 @@ from sofjax.simulation import (
     take_ride,
     webcam,
 )
-from sofjax.simulation.fittings import BLOCK_SPACING, BLOCK_WIDTH
-from sofjax.simulation.plan import inside, offset_walls, parts_inside, union_walls
-from sofjax.simulation.robots import clearance, drive_along, increments, read_path
-from sofjax.simulation.worlds import Areas
+from sofjax.simulation.robot import clearance, drive_along, increments, read_path
+from sofjax.simulation.world.furnishing import BLOCK_SPACING, BLOCK_WIDTH
+from sofjax.simulation.world.plan import inside, offset_walls, parts_inside, union_walls
+from sofjax.simulation.world.types import Areas
 
 CLEAN = Imaging(noise=0.0, blur=0.55, exposure_time=0.0, hunting=0.0, vignetting=0.0)
 NO_BOXES = {"boxes": np.zeros((0, 5)), "box_colours": np.zeros((0, 3))}
@@ -104,13 +104,13 @@ def test_parts_inside_cross_two_corridors():
 @pytest.mark.parametrize(("name", "seed"), SAMPLES)
 def test_truth_is_on_the_floor_inside_and_the_rest_is_not(name, seed):
     world = world_of(name, seed)
-    floor, raised = world.floor_segments, world.raised_segments
+    floor, off_floor = world.floor_segments, world.off_floor_segments
     assert (floor.endpoints[..., 2] == 0).all()
     middles = floor.endpoints[:, :, :2].mean(1)
     grown = world.corridors + np.array([-1e-6, -1e-6, 1e-6, 1e-6])
     assert inside(grown, middles).all()
     assert (np.linalg.norm(floor.endpoints[:, 1] - floor.endpoints[:, 0], axis=-1) > 0.05).all()
-    assert (raised.endpoints[..., 2].max(1) > 0).all()
+    assert (off_floor.endpoints[..., 2].max(1) > 0).all()
     assert (world.reflections.endpoints[..., 2] == -world.ceiling).all()
 
 
@@ -250,8 +250,8 @@ def project(camera_file, R, C, points):
     return np.stack([K[0, 0] * u + K[0, 2], K[1, 1] * v + K[1, 2]], axis=1), local[:, 2]
 
 
-def behind_a_wall(world, foot, points, margin=0.05):
-    """[n] whether the straight way from the camera's foot to a plan point crosses a wall.
+def behind_a_wall(world, nadir, points, margin=0.05):
+    """[n] whether the straight way from the camera's nadir to a plan point crosses a wall.
 
     The last `margin` metres of the way do not count: the wall that the point is on.
     """
@@ -260,22 +260,22 @@ def behind_a_wall(world, foot, points, margin=0.05):
         u, v = q - p, r - p
         return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
-    rays = points - foot
-    ends = foot + rays * (1 - margin / np.linalg.norm(rays, axis=1, keepdims=True))
+    rays = points - nadir
+    ends = nadir + rays * (1 - margin / np.linalg.norm(rays, axis=1, keepdims=True))
     a, b = world.walls[:, 0], world.walls[:, 1]
     ends = ends[:, None]
-    apart = side(a, b, ends) * side(a, b, foot) < 0
-    return (apart & (side(foot, ends, a) * side(foot, ends, b) <= 0)).any(1)
+    apart = side(a, b, ends) * side(a, b, nadir) < 0
+    return (apart & (side(nadir, ends, a) * side(nadir, ends, b) <= 0)).any(1)
 
 
 def edge_offsets(world, camera_file, ride, frames, kinds, narrow):
     """Distances in pixels of drawn edges from where the truth projects, along the normal."""
-    artist = Artist(world, camera_file, CLEAN)
+    renderer = Renderer(world, camera_file, CLEAN)
     truth = world.floor_segments
     offsets = []
     for i in frames:
         R, C = numpy_pose(camera_file, ride.truth.xy[i], ride.truth.yaw[i])
-        grey = cv2.cvtColor(artist.draw(R, C, ride.truth.stamps[i]), cv2.COLOR_BGR2GRAY).astype(
+        grey = cv2.cvtColor(renderer.draw(R, C, ride.truth.stamps[i]), cv2.COLOR_BGR2GRAY).astype(
             np.float32
         )
         for ends, kind in zip(truth.endpoints, truth.kinds, strict=True):
@@ -367,12 +367,12 @@ def test_walls_hide_what_is_behind_them():
     camera_file = webcam()
     camera_file = dataclasses.replace(camera_file, distortion=np.zeros(5))
     K = np.asarray(camera_file.camera.K, float)
-    artist = Artist(world, camera_file, dataclasses.replace(CLEAN, blur=0.0))
+    renderer = Renderer(world, camera_file, dataclasses.replace(CLEAN, blur=0.0))
     rng = np.random.default_rng(0)
     wrong = total = 0
     for xy, yaw in (([0.2, 6.5], 1.1), ([0.0, 8.0], 0.3), ([-0.3, 4.0], 1.7), ([5.0, 9.3], -2.9)):
         R, C = numpy_pose(camera_file, np.array(xy), yaw)
-        image = artist.draw(R, C, 0.0)
+        image = renderer.draw(R, C, 0.0)
         pixels = rng.integers(0, [320, 240], (300, 2))
         for u, v in pixels:
             ray = R @ np.linalg.solve(K, [u, v, 1])
@@ -393,9 +393,9 @@ def test_walls_hide_what_is_behind_them():
 def test_an_image_is_the_same_for_a_seed():
     world, camera_file = world_of("l"), office_camera()
     R, C = numpy_pose(camera_file, np.array([0.0, 2.0]), 1.5)
-    first, again = (Artist(world, camera_file, Imaging(), 5).draw(R, C, 0.0) for _ in range(2))
+    first, again = (Renderer(world, camera_file, Imaging(), 5).draw(R, C, 0.0) for _ in range(2))
     np.testing.assert_array_equal(first, again)
-    other = Artist(world, camera_file, Imaging(), 6).draw(R, C, 0.0)
+    other = Renderer(world, camera_file, Imaging(), 6).draw(R, C, 0.0)
     assert (first != other).any()
 
 
@@ -412,20 +412,20 @@ def test_any_lens_can_be_drawn_through(model, distortion):
     mount = Mount.create(height=0.11, pitch=0.35)
     camera_file = CameraFile(Camera(K, 320, 240), mount, np.array(distortion), model, "wide")
     R, C = numpy_pose(camera_file, np.array([0.0, 2.0]), 1.5)
-    image = Artist(world_of("l"), camera_file, Imaging()).draw(R, C, 0.0)
+    image = Renderer(world_of("l"), camera_file, Imaging()).draw(R, C, 0.0)
     assert image.shape == (240, 320, 3) and image.std() > 5
 
 
 def test_lsd_errs_on_drawn_images_as_on_the_sample_drive():
     """Within a factor of 1.5 of the sample's 1.2 cm and 0.28 degrees, medians within 5 m."""
     world, camera_file, ride = world_of("l", 2), office_camera(), ride_of("l", 2)
-    artist = Artist(world, camera_file, Imaging())
+    renderer = Renderer(world, camera_file, Imaging())
     K = np.asarray(camera_file.camera.K, float)
     truth = world.floor_segments.endpoints[:, :, :2]
     rho, theta = [], []
     for i in range(0, len(ride.truth.stamps), 6):
         R, C = numpy_pose(camera_file, ride.truth.xy[i], ride.truth.yaw[i])
-        image = cv2.undistort(artist.draw(R, C, ride.truth.stamps[i]), K, camera_file.distortion)
+        image = cv2.undistort(renderer.draw(R, C, ride.truth.stamps[i]), K, camera_file.distortion)
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         lines = cv2.createLineSegmentDetector().detect(grey)[0].reshape(-1, 2, 2) + 0.125
         inverse = np.linalg.inv(K @ R.T @ np.column_stack([[1, 0, 0], [0, 1, 0], -C]))
@@ -488,7 +488,7 @@ def test_exact_segments_are_visible_parts_of_the_worlds_edges(name, seed):
     world = world_of(name, seed)
     ride, observed = seen_exactly(name, seed, frames)
     camera_file = CameraFile(CAMERA, webcam().mount, np.zeros(5), "plumb_bob", "")
-    edges = [world.floor_segments, world.raised_segments, world.reflections]
+    edges = [world.floor_segments, world.off_floor_segments, world.reflections]
     ends = np.concatenate([kind.endpoints for kind in edges])
     for row, i in enumerate(frames):
         R, C = numpy_pose(camera_file, ride.truth.xy[i], ride.truth.yaw[i])
@@ -497,12 +497,12 @@ def test_exact_segments_are_visible_parts_of_the_worlds_edges(name, seed):
         assert valid.sum() > 3
         points = ends[:, :1] + np.linspace(0, 1, 401)[:, None] * (ends[:, 1:] - ends[:, :1])
         x, depth = project(camera_file, R, C, points.reshape(-1, 3))
-        hidden = depth < 0.05
+        truncated = depth < 0.05
         for segment in segments[valid]:
             assert (segment > -0.1).all() and (segment < [319.1, 239.1]).all()
             middle = segment.mean(0)
             # the line of the nearest sampled edge passes through both ends
-            gap = np.where(hidden, np.inf, np.linalg.norm(x - middle, axis=1))
+            gap = np.where(truncated, np.inf, np.linalg.norm(x - middle, axis=1))
             candidates = np.unique(np.argsort(gap)[:40] // 401)
             errors = []
             for edge in candidates:

@@ -14,12 +14,12 @@ import reference
 from conftest import jit_quickly, make_camera
 
 from sofjax import slam
+from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Mount, Segments, projection_matrix
 from sofjax.motion import MotionModel
-from sofjax.observation import Observation
 from sofjax.particles import effective_size
-from sofjax.presets import DEFAULT, PAPER
 from sofjax.segment_map import final_map
+from sofjax.slam.presets import DEFAULT, PAPER
 
 T, M, N, K = 40, 32, 64, 96
 
@@ -164,7 +164,7 @@ def test_a_wheel_that_spins_is_found_out():
     With the default number of particles: of few, none may try a slip of that size.
     """
     config = dataclasses.replace(
-        CONFIG, filter=dataclasses.replace(CONFIG.filter, particles=slam.FilterRules().particles)
+        CONFIG, filter=dataclasses.replace(CONFIG.filter, particles=slam.FilterConfig().particles)
     )
     true, observations = drive()
     spun = eqx.tree_at(
@@ -278,7 +278,7 @@ def test_another_key_gives_another_run():
 
 def test_the_first_image_begins_no_lines_and_a_baseline_later_some_are_known():
     _, info = default_run()
-    assert info.born[0] == info.associated[0] == info.matched[0] == 0
+    assert info.initialised[0] == info.associated[0] == info.matched[0] == 0
     assert info.associated[4:].min() > 0
     assert info.matched[6:].min() > 0
 
@@ -306,18 +306,18 @@ def test_the_funnel_narrows():
     for wide, narrow in (
         (info.detected, info.below_horizon),
         (info.below_horizon, info.associated),
-        (info.below_horizon, info.matched + info.born),
+        (info.below_horizon, info.matched + info.initialised),
     ):
         assert (wide >= narrow).all()
     counts = (np.asarray(info.segment_class)[..., None] >= [1, 2, 3]).sum(axis=1)
     np.testing.assert_array_equal(counts[:, 0], info.detected)
     np.testing.assert_array_equal(counts[:, 1], info.below_horizon)
-    assert (counts[:, 2] >= info.matched + info.born).all()
+    assert (counts[:, 2] >= info.matched + info.initialised).all()
 
 
 def test_the_map_counts_what_was_born():
     state, info = default_run()
-    assert 0 < state.segment_map.valid.sum() <= info.born.sum()
+    assert 0 < state.segment_map.valid.sum() <= info.initialised.sum()
 
 
 def test_black_images_leave_the_map_as_it_is_and_follow_the_odometer():
@@ -446,7 +446,7 @@ def test_the_paper_s_settings_run_with_a_single_winner():
 def test_the_final_map_worked_by_hand():
     """Seen often, in most images that should show it, of known height, and on the floor."""
     rules = CONFIG.segment_map
-    cases = [  # kappa, its sigma, updates, expected, valid -> of the map
+    cases = [  # the apparent scale, its sigma, updates, expected, valid -> of the map
         (1.0, 0.01, 20, 20, True, True),
         (1.0, 0.01, rules.min_updates - 1, 4, True, False),
         (1.0, 0.01, 20, 200, True, False),  # a tenth of the images that should have shown it
@@ -454,13 +454,15 @@ def test_the_final_map_worked_by_hand():
         (1.0, 0.20, 20, 20, True, False),  # who knows
         (1.0, 0.01, 20, 20, False, False),
     ]
-    kappa, sigma, updates, expected, valid, of_the_map = map(np.array, zip(*cases, strict=True))
+    apparent_scale, sigma, updates, expected, valid, of_the_map = map(
+        np.array, zip(*cases, strict=True)
+    )
     n = len(cases)
     empty = start().segment_map
     m = dataclasses.replace(
         empty,
         segments_world=Segments(empty.segments_world.endpoints, empty.valid.at[:n].set(valid)),
-        line=empty.line.at[:n, 2].set(kappa),
+        line=empty.line.at[:n, 2].set(apparent_scale),
         covariance=empty.covariance.at[:n, 2, 2].set(sigma**2),
         updates=empty.updates.at[:n].set(updates),
         expected=empty.expected.at[:n].set(expected),
@@ -469,7 +471,7 @@ def test_the_final_map_worked_by_hand():
     np.testing.assert_array_equal(found.is_floor[:n], of_the_map)
     assert not found.is_floor[n:].any()
     np.testing.assert_allclose(found.height[3], 0.6 - 0.6 / 1.2, rtol=1e-5)
-    np.testing.assert_allclose(found.height_sigma[:n], 0.6 * sigma / kappa**2, rtol=1e-4)
+    np.testing.assert_allclose(found.height_sigma[:n], 0.6 * sigma / apparent_scale**2, rtol=1e-4)
 
 
 def test_runs_side_by_side_are_the_runs_one_by_one():

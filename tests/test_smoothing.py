@@ -11,11 +11,11 @@ import pytest
 from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floor_to_image
 from sofjax.motion import MotionModel
 from sofjax.smoothing import Keyframes, Priors, Problem, Unknowns, residuals, solve
-from sofjax.smoothing.blocks import Jacobian
-from sofjax.smoothing.dissection import dissect, divide
-from sofjax.smoothing.elimination import eliminate
-from sofjax.smoothing.marginals import marginals
 from sofjax.smoothing.problem import odometer_residual
+from sofjax.smoothing.sparse.blocks import Jacobian
+from sofjax.smoothing.sparse.dissection import dissect, divide
+from sofjax.smoothing.sparse.elimination import eliminate
+from sofjax.smoothing.sparse.marginals import marginals
 
 pytestmark = pytest.mark.slow  # compiles in double precision, minutes on a busy machine
 
@@ -68,8 +68,10 @@ def problem():
         keyframes = Keyframes(
             Segments(image, jnp.ones((N, K), bool)), index, jnp.asarray(known), motion, way
         )
-        raised = jnp.zeros(K, bool).at[2].set(True)
-        problem = Problem(camera, mount, MotionModel(), Priors(), keyframes, anchor, raised, start)
+        off_floor = jnp.zeros(K, bool).at[2].set(True)
+        problem = Problem(
+            camera, mount, MotionModel(), Priors(), keyframes, anchor, off_floor, start
+        )
         return problem, pose
 
 
@@ -143,12 +145,12 @@ def test_the_jacobian_transposed_is_the_gradient_of_half_the_squares(problem):
         half = lambda u: 0.5 * sum((r**2).sum() for r in jax.tree.leaves(residuals(u, problem)))
         want = jax.grad(half)(problem.start)
         r, jvp = jax.linearize(lambda v: residuals(v, problem), problem.start)
-        got, sighted = Jacobian.of(jvp, problem.start).transposed(problem.keyframes, r)
+        got, measured = Jacobian.of(jvp, problem.start).transposed(problem.keyframes, r)
         for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
         seen = lambda u: 0.5 * (residuals(u, problem).pixels ** 2).sum()
         want = jax.grad(seen)(problem.start).line
-        np.testing.assert_allclose(sighted, want, rtol=1e-9, atol=1e-9 * np.abs(want).max())
+        np.testing.assert_allclose(measured, want, rtol=1e-9, atol=1e-9 * np.abs(want).max())
 
 
 def test_keyframes_of_one_place_are_of_one_leaf_however_often_it_is_passed(rng):

@@ -8,30 +8,30 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floor_to_image
 from sofjax.motion import MotionModel
-from sofjax.observation import Observation
-from sofjax.segment_map import MapRules, empty_map
-from sofjax.slam import SlamConfig
+from sofjax.segment_map import MapConfig, empty_map
+from sofjax.slam.step import SlamConfig
 from sofjax.smoothing import (
     Keyframes,
     Path,
     Priors,
     Problem,
     Seeing,
-    SmoothingRules,
+    SmoothingConfig,
     Unknowns,
-    rounds,
     smooth,
+    smoother,
 )
 from sofjax.smoothing import keyframes as kf
-from sofjax.smoothing.dissection import dissect
-from sofjax.smoothing.elimination import Factors
-from sofjax.smoothing.lines import associate, lines_of
-from sofjax.smoothing.marginals import Marginals
-from sofjax.smoothing.merging import doubles, representatives
+from sofjax.smoothing.association.duplicates import duplicates, representatives
+from sofjax.smoothing.association.lines import associate, lines_of
+from sofjax.smoothing.association.revisits import apart
 from sofjax.smoothing.solution import solve
-from sofjax.smoothing.ties import apart
+from sofjax.smoothing.sparse.dissection import dissect
+from sofjax.smoothing.sparse.elimination import Factors
+from sofjax.smoothing.sparse.marginals import Marginals
 
 
 def straight(n, step=0.1):
@@ -90,16 +90,18 @@ def test_carried_poses_go_through_their_keyframes_and_keep_the_motion_between(x6
     np.testing.assert_allclose(through.xy[index], any_pose.xy, atol=1e-6)
 
 
-def lines_along_x(y, reach, raised=None):
+def lines_along_x(y, reach, off_floor=None):
     """Lines parallel to the x axis, described from the origin."""
     K = len(y)
     ends = jnp.stack(
         [jnp.asarray(reach, float), jnp.broadcast_to(jnp.asarray(y)[:, None], (K, 2))], -1
     )
-    raised = jnp.zeros(K, bool) if raised is None else jnp.asarray(raised)
-    line = jnp.stack([jnp.asarray(y, float), jnp.zeros(K), 1 + 0.1 * raised.astype(float)], axis=1)
+    off_floor = jnp.zeros(K, bool) if off_floor is None else jnp.asarray(off_floor)
+    line = jnp.stack(
+        [jnp.asarray(y, float), jnp.zeros(K), 1 + 0.1 * off_floor.astype(float)], axis=1
+    )
     anchor = SE2(jnp.zeros((K, 2)), jnp.zeros(K))
-    return lines_of(anchor, line, ends, raised, jnp.ones(K, bool))
+    return lines_of(anchor, line, ends, off_floor, jnp.ones(K, bool))
 
 
 CAMERA = Camera(jnp.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]), 320, 240)
@@ -137,7 +139,7 @@ def test_a_segment_shows_the_nearest_line_that_reaches_it():
     ("y", "driven", "shows"),
     [
         (0.3, 5.0, True),
-        (0.0, 5.0, False),  # it points to the foot, as an edge of a door does
+        (0.0, 5.0, False),  # it points to the nadir, as an edge of a door does
         (0.3, 9.0, False),  # after the part of the way in which the line may be seen
     ],
 )
@@ -164,7 +166,7 @@ def drive_past(known, line, driven, lines):
     )  # fmt: skip
     start = Unknowns(jnp.zeros((n, 5)), lines.line, jnp.zeros(8))
     return Problem(
-        CAMERA, MOUNT, MotionModel(), Priors(), frames, lines.anchor, lines.raised, start
+        CAMERA, MOUNT, MotionModel(), Priors(), frames, lines.anchor, lines.off_floor, start
     )
 
 
@@ -180,7 +182,7 @@ def test_what_is_seen_again_after_a_way_is_another_line():
     assert passes.valid.tolist() == [True, True, True, False]
     np.testing.assert_allclose(passes.span[:3], [[-5, 8], [-5, 8], [15, 27]], atol=1e-6)
     np.testing.assert_allclose(passes.line[2], lines.line[0])
-    assert passes.raised.tolist()[:3] == [False, False, True]  # its height is anew to be found
+    assert passes.off_floor.tolist()[:3] == [False, False, True]  # its height is anew to be found
     same, _ = apart(problem, lines, passing=np.inf, least=3, room=4)
     assert same.keyframes.line.tolist() == line.tolist()
 
@@ -189,10 +191,10 @@ def test_what_may_as_well_be_one_as_another_is_left_for_later():
     lines = lines_along_x([0.0, 0.1, 0.05], [(1, 2), (1, 2), (1, 2)])
     sigma = jnp.diag(jnp.array([0.05, 0.01, 1e-6]))
     joint = jnp.zeros((3, 3, 3, 3)).at[2, :, 2, :].set(sigma @ sigma)
-    _, joins = doubles(lines, known(joint), jnp.array([9, 8, 4]))
+    _, joins = duplicates(lines, known(joint), jnp.array([9, 8, 4]))
     assert not joins.any()  # the first two are two, and the third may be either
     lines = lines_along_x([0.0, 0.1, 0.05], [(1, 2), (5, 6), (1, 2)])
-    _, joins = doubles(lines, known(joint), jnp.array([9, 8, 4]))
+    _, joins = duplicates(lines, known(joint), jnp.array([9, 8, 4]))
     assert joins.tolist() == [False, False, True]
 
 
@@ -202,12 +204,12 @@ def test_two_that_are_known_to_be_two_are_not_both_made_one_with_a_third(y, join
     lines = lines_along_x([0.0, 0.2, y], [(1, 2)] * 3)
     sigma = jnp.diag(jnp.array([0.1, 0.01, 1e-6]))
     joint = jnp.einsum("ab,kl->kalb", sigma @ sigma, jnp.diag(jnp.array([0.01, 1.0, 1.0])))
-    _, found = doubles(lines, known(joint), jnp.array([9, 5, 4]))
+    _, found = duplicates(lines, known(joint), jnp.array([9, 5, 4]))
     assert found.tolist() == joins
 
 
 @pytest.mark.parametrize(
-    ("y", "reach", "raised", "together", "is_one"),
+    ("y", "reach", "off_floor", "together", "is_one"),
     [
         (0.1, (1, 2), False, False, True),  # 10 cm off where 5 cm are a standard deviation
         (0.1, (1, 2), False, True, False),  # but seen side by side they are two edges
@@ -217,29 +219,31 @@ def test_two_that_are_known_to_be_two_are_not_both_made_one_with_a_third(y, join
     ],
 )
 def test_lines_are_one_where_what_is_known_of_both_together_allows_it(
-    y, reach, raised, together, is_one
+    y, reach, off_floor, together, is_one
 ):
-    lines = lines_along_x([0.0, y], [(1, 2), reach], [False, raised])
+    lines = lines_along_x([0.0, y], [(1, 2), reach], [False, off_floor])
     sigma = jnp.diag(jnp.array([0.05, 0.01, 1e-6]))
     joint = jnp.zeros((2, 3, 2, 3)).at[0, :, 0, :].set(0.01 * sigma @ sigma)
     joint = joint.at[1, :, 1, :].set(sigma @ sigma)
     if together:  # the same error in both: their difference is known well
         joint = jnp.broadcast_to((sigma @ sigma)[None, :, None, :], (2, 3, 2, 3))
-    into, joins = doubles(lines, known(joint), jnp.array([9, 4]))
+    into, joins = duplicates(lines, known(joint), jnp.array([9, 4]))
     assert joins.tolist() == [False, is_one]
     assert not is_one or into[1] == 0
 
 
-@pytest.mark.parametrize(("vague", "is_one"), [(True, False), (False, True)])
-def test_two_edges_of_the_floor_are_not_made_one_by_heights_that_are_free(vague, is_one):
+@pytest.mark.parametrize(("undetermined", "is_one"), [(True, False), (False, True)])
+def test_two_edges_of_the_floor_are_not_made_one_by_heights_that_are_free(undetermined, is_one):
     """Each passed on another side, which shifts what stands above the floor the other way."""
     lines = lines_along_x([0.0, 0.1], [(1, 2), (1, 2)], [True, True])
     lines = eqx.tree_at(
-        lambda l: (l.line, l.vague), lines, (lines.line.at[:, 2].set(1), jnp.array([vague] * 2))
+        lambda l: (l.line, l.undetermined),
+        lines,
+        (lines.line.at[:, 2].set(1), jnp.array([undetermined] * 2)),
     )
-    passed = jnp.array([[0.8, 0, 1], [-0.8, 0, 1]]) * 0.1  # metres, radians, kappa
+    passed = jnp.array([[0.8, 0, 1], [-0.8, 0, 1]]) * 0.1  # metres, radians, the apparent scale
     joint = jnp.einsum("ka,kb,kl->kalb", passed, passed, jnp.eye(2))
-    _, joins = doubles(lines, known(joint), jnp.array([9, 4]))
+    _, joins = duplicates(lines, known(joint), jnp.array([9, 4]))
     assert joins.tolist() == [False, is_one]
 
 
@@ -261,7 +265,7 @@ def known(joint):
 
 
 @pytest.mark.parametrize(
-    ("kappa", "sigma", "raised", "is_shown"),
+    ("apparent_scale", "sigma", "off_floor", "is_shown"),
     [
         (1.01, 0.01, False, True),
         (1.10, 0.02, True, False),
@@ -270,11 +274,13 @@ def known(joint):
         (1.02, 0.10, True, False),  # ... or anything
     ],
 )
-def test_lines_of_the_floor_are_shown(kappa, sigma, raised, is_shown):
+def test_lines_of_the_floor_are_shown(apparent_scale, sigma, off_floor, is_shown):
     lines = lines_along_x([0.3], [(1, 2)])
-    vague = raised and sigma > SmoothingRules().kappa_known
-    lines = replace(lines, raised=jnp.array([raised]), vague=jnp.array([vague]))
-    told = rounds.shown(MapRules(), SmoothingRules(), lines, jnp.array([kappa]), jnp.array([sigma]))
+    undetermined = off_floor and sigma > SmoothingConfig().scale_known
+    lines = replace(lines, off_floor=jnp.array([off_floor]), undetermined=jnp.array([undetermined]))
+    told = smoother.shown(
+        MapConfig(), SmoothingConfig(), lines, jnp.array([apparent_scale]), jnp.array([sigma])
+    )
     assert bool(told[0]) == is_shown
 
 
@@ -307,7 +313,7 @@ def test_rounds_find_the_path_that_the_odometer_misread(rng, monkeypatch):
     log = Observation(noisy, read, jnp.zeros(41, int))
     wrong = floor * [1.03, 1.0]  # [48, 2, 2]
     K = len(floor)
-    m = empty_map(MapRules(capacity=K))
+    m = empty_map(MapConfig(capacity=K))
     d = wrong[:, 1] - wrong[:, 0]
     theta = np.arctan2(d[:, 1], d[:, 0])
     rho = -np.sin(theta) * wrong[:, 0, 0] + np.cos(theta) * wrong[:, 0, 1]
@@ -326,8 +332,8 @@ def test_rounds_find_the_path_that_the_odometer_misread(rng, monkeypatch):
         kinds.add(str(jax.eval_shape(lambda *a: a, problem, dissection)))
         return solve(problem, dissection, **how)
 
-    monkeypatch.setattr(rounds, "solve", solve_of_one_kind)
-    done = smooth(SlamConfig(), CAMERA, MOUNT, log, path, m, SmoothingRules(rounds=2))
+    monkeypatch.setattr(smoother, "solve", solve_of_one_kind)
+    done = smooth(SlamConfig(), CAMERA, MOUNT, log, path, m, SmoothingConfig(rounds=2))
     assert len(kinds) == 1  # compiled once, before lines are merged and after
     assert done.solution.converged
     np.testing.assert_allclose(done.T_world_robot.xy, T.xy, atol=0.01)
@@ -338,7 +344,7 @@ def test_rounds_find_the_path_that_the_odometer_misread(rng, monkeypatch):
     bars = done.lines.valid[24:48]
     assert bars.sum() >= 22
     ends = done.endpoints_world[24:48]
-    often = bars & (done.sightings[24:48] > 8)
+    often = bars & (done.measurements[24:48] > 8)
     assert often.sum() >= 8
     np.testing.assert_allclose(
         ends[often].mean(1)[:, 0], floor[24:].mean(1)[often][:, 0], atol=0.02

@@ -7,9 +7,9 @@ import pytest
 import reference
 from conftest import jit_quickly
 
-from sofjax.association import Association
+from sofjax.extraction.association import Association
+from sofjax.extraction.sof import below_horizon, extract, put_on_floor
 from sofjax.geometry import SE2, Mount, Segments
-from sofjax.sof import below_horizon, extract, put_on_floor
 
 pytestmark = pytest.mark.usefixtures("x64")
 

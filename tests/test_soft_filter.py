@@ -14,13 +14,13 @@ from conftest import jit_quickly
 from test_likelihood import as_arrays, random_problem
 
 from sofjax import slam
-from sofjax.association import Association, gate_probability
+from sofjax.extraction.association import Association, gate_probability
 from sofjax.geometry import SE2
-from sofjax.likelihood import log_density
+from sofjax.likelihood.measurements import SensorModel
+from sofjax.likelihood.tracking import log_density
 from sofjax.motion import OdometerBias
 from sofjax.particles import Particles, systematic
-from sofjax.presets import DEFAULT
-from sofjax.sightings import SensorModel
+from sofjax.slam.presets import DEFAULT
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -86,8 +86,8 @@ def test_what_is_too_vague_to_be_used_counts_as_anywhere_in_the_image():
     """Else a sigma that leaves all segments out would be the likeliest."""
     program, at, observations = differentiated()
     (usual, _), _ = program(at, observations)
-    vague = at.at[VARIABLES.index(("sensor", "pixel_sigma"))].set(100.0)
-    (value, info), _ = program(vague, observations)
+    undetermined = at.at[VARIABLES.index(("sensor", "pixel_sigma"))].set(100.0)
+    (value, info), _ = program(undetermined, observations)
     assert info.below_horizon.sum() == 0 < info.detected.sum()
     pixels = test_slam.CAMERA.width * test_slam.CAMERA.height
     assert value == pytest.approx(-np.log(pixels) * int(info.detected.sum()), rel=1e-6)
@@ -122,19 +122,21 @@ SENSOR = SensorModel(tilt_sigma=0.01)
 CERTAIN = 1 - 1e-12
 
 
-def density(sightings, candidates, known, lines=1.0, elsewhere=-11.0, sensor=SENSOR):
+def density(measurements, candidates, known, lines=1.0, elsewhere=-11.0, sensor=SENSOR):
     known, lines, elsewhere = (jnp.asarray(a, float) for a in (known, lines, elsewhere))
-    known = jnp.broadcast_to(known, sightings.valid.shape)
-    return log_density(sensor, sightings, candidates, SE2.identity(), known, lines, elsewhere)
+    known = jnp.broadcast_to(known, measurements.valid.shape)
+    return log_density(sensor, measurements, candidates, SE2.identity(), known, lines, elsewhere)
 
 
 def test_lines_that_are_certain_have_the_density_of_one_gaussian(rng):
-    """All errors of an image together: their own covariances and what the wobble makes alike."""
-    near, lines, kappa, W, _ = random_problem(rng)
-    lines, kappa, W = lines[:, :1], kappa[:, :1], W[:, :1]
+    """All errors of an image together: their own covariances and what the jitter makes alike."""
+    near, lines, apparent_scale, W, _ = random_problem(rng)
+    lines, apparent_scale, W = lines[:, :1], apparent_scale[:, :1], W[:, :1]
     near = lines[:, 0] + rng.normal(0, 0.02, size=near.shape)
     J = rng.normal(size=(len(near), 2, 2))
-    arrays = as_arrays(near, lines, kappa, W, np.ones((len(near), 1), bool), J, SENSOR.tilt_sigma)
+    arrays = as_arrays(
+        near, lines, apparent_scale, W, np.ones((len(near), 1), bool), J, SENSOR.tilt_sigma
+    )
     found = density(*arrays, known=CERTAIN, lines=5.0, elsewhere=-1e3)
     S = np.zeros((2 * len(near),) * 2)
     for m, precision in enumerate(W[:, 0]):
@@ -147,16 +149,18 @@ def test_lines_that_are_certain_have_the_density_of_one_gaussian(rng):
 
 
 def test_segments_that_are_no_line_have_the_density_of_the_image(rng):
-    sightings, candidates = as_arrays(*random_problem(rng))
-    M = len(sightings.valid)
-    assert density(sightings, candidates, known=0.0, elsewhere=-11.0) == pytest.approx(-11.0 * M)
+    measurements, candidates = as_arrays(*random_problem(rng))
+    M = len(measurements.valid)
+    assert density(measurements, candidates, known=0.0, elsewhere=-11.0) == pytest.approx(-11.0 * M)
 
 
 def test_a_line_seen_twice_as_large_in_the_image_is_twice_as_improbable_a_pixel(rng):
-    sightings, candidates = as_arrays(*random_problem(rng))
-    larger = dataclasses.replace(sightings, log_area=jnp.full(len(sightings.valid), np.log(2.0)))
+    measurements, candidates = as_arrays(*random_problem(rng))
+    larger = dataclasses.replace(
+        measurements, log_area=jnp.full(len(measurements.valid), np.log(2.0))
+    )
     many = density(larger, candidates, CERTAIN, elsewhere=-1e7)
-    once = density(sightings, candidates, CERTAIN, elsewhere=-1e7)
+    once = density(measurements, candidates, CERTAIN, elsewhere=-1e7)
     met = np.asarray(candidates.valid).any(axis=1).sum()
     assert many - once == pytest.approx(met * np.log(2.0), rel=1e-6)
 

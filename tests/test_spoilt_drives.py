@@ -17,7 +17,7 @@ from sofjax.evaluation import evaluate_trajectory
 from sofjax.geometry import SE2
 from sofjax.io.drive import motion_sigmas, motions, odometry_warnings, read_drive
 from sofjax.io.trajectory import Trajectory
-from sofjax.presets import DEFAULT
+from sofjax.slam.presets import DEFAULT
 from sofjax.vision import Frontend, observe_drive
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"

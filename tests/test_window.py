@@ -13,13 +13,22 @@ from test_slam import CAMERA, CONFIG, MOUNT, black, drive, start
 
 from sofjax import slam
 from sofjax.geometry import SE2, Segments
+from sofjax.likelihood.measurements import measure
 from sofjax.motion import MotionModel, OdometerBias
 from sofjax.segment_map import empty_map
-from sofjax.sightings import sight
-from sofjax.window import BIAS, POSE, Known, WindowRules, _Linear, _step, empty_window, slide
+from sofjax.slam.fixed_lag import (
+    BIAS,
+    POSE,
+    FixedLagConfig,
+    Known,
+    _Linear,
+    _step,
+    empty_window,
+    slide,
+)
 
 J, M = 6, 16
-OPEN = dataclasses.replace(CONFIG, window=WindowRules(keyframes=8, lines=32))
+OPEN = dataclasses.replace(CONFIG, window=FixedLagConfig(keyframes=8, lines=32))
 
 
 @pytest.mark.usefixtures("x64")
@@ -72,28 +81,32 @@ def seen_from(camera, mount, pose):
     seen = reference.look(camera, mount, pose, FLOOR)
     ends[: len(seen)] = seen
     segments = Segments(jnp.asarray(ends), jnp.arange(M) < len(seen))
-    return sight(CONFIG.sensor, camera, mount, segments, 8.0)
+    return measure(CONFIG.sensor, camera, mount, segments, 8.0)
 
 
 @pytest.mark.usefixtures("x64")
 def test_an_estimate_that_is_off_comes_back_with_the_window(camera, mount):
     """Lines seen without noise, an odometer that reads three per cent too much."""
-    rules, map_rules = WindowRules(keyframes=5, lines=16), CONFIG.segment_map
+    rules, map_config = FixedLagConfig(keyframes=5, lines=16), CONFIG.segment_map
     model = MotionModel(distance_scale_sigma=0.05)
     bias = OdometerBias(jnp.zeros(4), jnp.diag(jnp.array([0.05, 0.05, 0.05, 0.005]) ** 2))
     go = jit_quickly(slide)
-    foot, drifted = mount.T_robot_foot, None
+    nadir, drifted = mount.T_robot_nadir, None
     step = SE2(jnp.array([0.2, 0.0]), jnp.array(0.02))
     read = SE2(jnp.array([0.206, 0.0]), jnp.array(0.02))
     true = estimate = SE2.identity()
     for i in range(5):
-        sightings = seen_from(camera, mount, (*np.asarray(true.xy), float(true.yaw)))
+        measurements = seen_from(camera, mount, (*np.asarray(true.xy), float(true.yaw)))
         if i == 0:
-            m, window = map_of(sightings, foot), empty_window(rules, map_rules.capacity, sightings)
-        new = jnp.where(sightings.valid, jnp.arange(M), map_rules.capacity)
+            m, window = (
+                map_of(measurements, nadir),
+                empty_window(rules, map_config.capacity, measurements),
+            )
+        new = jnp.where(measurements.valid, jnp.arange(M), map_config.capacity)
         window, m, T = go(
-            rules, map_rules, CONFIG.sensor, model, window, m, foot, read if i else true, estimate,
-            jnp.zeros(2), bias, sightings, new if i == 0 else jnp.full(M, map_rules.capacity), 8.0,
+            rules, map_config, CONFIG.sensor, model, window, m, nadir, read if i else true,
+            estimate, jnp.zeros(2), bias, measurements,
+            new if i == 0 else jnp.full(M, map_config.capacity), 8.0,
         )  # fmt: skip
         drifted = estimate
         estimate = T @ estimate
@@ -104,18 +117,19 @@ def test_an_estimate_that_is_off_comes_back_with_the_window(camera, mount):
     assert int(window.count) == 5
 
 
-def map_of(sightings, T_world_foot):
+def map_of(measurements, T_world_nadir):
     """Each segment of the first image begins a line, in the slot of its number."""
-    m, n = empty_map(CONFIG.segment_map), int(sightings.valid.sum())
-    line = jnp.stack([sightings.line.rho, sightings.line.theta, jnp.ones(M)], axis=1)[:n]
-    ends = T_world_foot.apply(sightings.endpoints_foot[:n])
+    m, n = empty_map(CONFIG.segment_map), int(measurements.valid.sum())
+    line = jnp.stack([measurements.line.rho, measurements.line.theta, jnp.ones(M)], axis=1)[:n]
+    ends = T_world_nadir.apply(measurements.endpoints_nadir[:n])
     put = lambda a, b: a.at[:n].set(b)
     return eqx.tree_at(
         lambda m: (m.segments_world.endpoints, m.segments_world.valid, m.line, m.covariance,
                    m.anchor.xy, m.updates),
         m,
         (put(m.segments_world.endpoints, ends), put(m.segments_world.valid, True),
-         put(m.line, line), put(m.covariance, 1e-3 * jnp.eye(3)), put(m.anchor.xy, T_world_foot.xy),
+         put(m.line, line), put(m.covariance, 1e-3 * jnp.eye(3)),
+         put(m.anchor.xy, T_world_nadir.xy),
          put(m.updates, 9)),
     )  # fmt: skip
 

@@ -26,7 +26,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import batch
+import sofjax
 from sofjax.geometry import (
     SE2,
     Camera,
@@ -151,7 +151,7 @@ def by_pose(*arguments):
     """Value and gradient of each particle's own likelihood."""
     total = lambda particles: (
         lambda values: (values.sum(), values)
-    )(batch.log_likelihood(particles, *arguments[1:], soft=True))  # fmt: skip
+    )(sofjax.log_likelihood(particles, *arguments[1:], soft=True))  # fmt: skip
     gradient, values = jax.grad(total, has_aux=True)(arguments[0])
     return values, gradient
 
@@ -159,7 +159,7 @@ def by_pose(*arguments):
 def of_image(height_pitch, camera, mount, segments_image, particles, segment_map, *noise):
     """The soft form as a function of the mount."""
     mount = Mount(mount.x, mount.y, *height_pitch, mount.roll, mount.yaw)
-    return batch.image_log_likelihood(
+    return sofjax.image_log_likelihood(
         camera, mount, particles, segments_image, segment_map, *noise, max_depth=30.0
     )
 
@@ -183,11 +183,11 @@ def forms(problem: dict) -> dict:
     particles, _, *rest = given
     at = jnp.stack([mount.height, mount.pitch])
     image = (at, camera, mount, segments_image, particles, *rest)
-    library = lambda **how: lambda *a: batch.log_likelihood(*a, **how)
+    library = lambda **how: lambda *a: sofjax.log_likelihood(*a, **how)
     jitted = {
         "library": (library(), given),
         "every pair": (library(prune=False), given),
-        "pruned": (lambda *a: batch.log_likelihood_pruned(*a)[0], given),
+        "pruned": (lambda *a: sofjax.log_likelihood_pruned(*a)[0], given),
         "soft": (library(soft=True), given),
         "soft, every pair": (library(soft=True, prune=False), given),
         "soft + pose gradient": (by_pose, given),
@@ -296,7 +296,7 @@ def main():
         problem = dict(np.load(options.problem))
         figures = benchmark(problem, rounds, without=("chunked numpy", "naive triple vmap"))
         if options.out:
-            values = jax.jit(batch.log_likelihood)(*arguments(problem))
+            values = jax.jit(sofjax.log_likelihood)(*arguments(problem))
             np.savez(options.out, log_likelihood=np.asarray(values))
         result |= {"cpu_ms": figures["library"]["cpu_ms"], "forms": figures}
         problems = {options.problem: figures}

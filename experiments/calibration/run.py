@@ -20,7 +20,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 from mount_logs import EXACT, EXACT_MODEL, cramer_rao, make_log, roughly
 
-from sofjax.calibration import TURNS, DriveRules, FitRules, PairNoise, TrackRules, fit_drive
+from sofjax.calibration import TURNS, DriveFitConfig, FitConfig, PairNoise, TrackConfig, fit_drive
 from sofjax.simulation import Odometer, around, furnish, make_world
 
 NOISE, CAPACITY = 0.5, 1024
@@ -65,13 +65,13 @@ def corridor(floor: str, seed: int):
     return furnish(floor, around(bend, 2.0), way, floor, np.random.default_rng([seed, 5]))
 
 
-def fit_rules(setting: Setting) -> DriveRules:
+def fit_rules(setting: Setting) -> DriveFitConfig:
     """The odometer is as exact as it is; its turns are free only where they err."""
     turns = TURNS if setting.odometer.right != 1 else ()
-    return DriveRules(
-        track=TrackRules(baseline=setting.longest / 4, longest=setting.longest),
+    return DriveFitConfig(
+        track=TrackConfig(baseline=setting.longest / 4, longest=setting.longest),
         noise=PairNoise(setting.noise, EXACT_MODEL),
-        fit=FitRules(free=(*MOUNT, *turns), pixel_sigma=setting.noise),
+        fit=FitConfig(free=(*MOUNT, *turns), pixel_sigma=setting.noise),
         starts=((1.0, 0.0),),
         capacity=setting.pairs,
     )

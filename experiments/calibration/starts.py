@@ -22,11 +22,11 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax.calibration import DriveRules, fit_drive
+from sofjax.calibration import DriveFitConfig, fit_drive
 from sofjax.io.drive import read_drive
 from sofjax.vision import Frontend, observe_drive
 
-RULES = DriveRules()
+RULES = DriveFitConfig()
 
 
 def main() -> None:

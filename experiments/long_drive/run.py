@@ -46,7 +46,7 @@ def draw(drive, online, done, path: Path) -> None:
     from matplotlib.collections import LineCollection
 
     plot, (above, below) = common.pyplot().subplots(2, 1, figsize=(11, 5.5), layout="constrained")
-    ends = np.asarray(done.endpoints_world)[done.lines.valid & ~done.lines.raised]
+    ends = np.asarray(done.endpoints_world)[done.lines.valid & ~done.lines.off_floor]
     turned = lambda xy: np.stack([-xy[..., 1], xy[..., 0]], axis=-1)  # the rings beside each other
     above.add_collection(LineCollection(turned(ends), colors="#1f618d", lw=0.7))
     above.plot(*turned(common.in_start(drive.truth)).T, color="black", lw=0.5)

@@ -22,7 +22,7 @@ from mount_logs import EXACT_MODEL, cramer_rao, make_log, roughly
 
 from sofjax.calibration import (
     PairNoise,
-    TrackRules,
+    TrackConfig,
     distances,
     expected,
     fit_mount,
@@ -90,7 +90,7 @@ def study(seed: int):
     """Errors, sigmas and the bound of one log; None where it has too few pairs for any fit."""
     camera, mount, log = make_log(make_world("random", seed), seed, NOISE)
     rough = roughly(mount)
-    rules = TrackRules()
+    rules = TrackConfig()
     noise = PairNoise(pixel_sigma=NOISE, odometer=EXACT_MODEL)
     # a wrong mount prefers pairs that seem to prove it: that is not what is asked here
     track = follow(rules, camera, start_at(mount), log)

@@ -61,7 +61,7 @@ def differences(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.nd
     return distance, np.abs((angle + np.pi / 2) % np.pi - np.pi / 2)
 
 
-def visible(H_F: np.ndarray, size: tuple, foot: np.ndarray, points: np.ndarray, walls: np.ndarray):
+def visible(H_F: np.ndarray, size: tuple, nadir: np.ndarray, points: np.ndarray, walls: np.ndarray):
     """Which floor points [n, 2] are in the picture, near enough and not behind a wall."""
     x = np.column_stack([points, np.ones(len(points))]) @ H_F.T
     depth = np.where(x[:, 2] > 0.1, x[:, 2], np.inf)
@@ -81,11 +81,11 @@ def visible(H_F: np.ndarray, size: tuple, foot: np.ndarray, points: np.ndarray, 
                 r[..., 0] - p[..., 0]
             )
 
-        near = points + 0.05 * (foot - points) / np.linalg.norm(
-            foot - points, axis=1, keepdims=True
+        near = points + 0.05 * (nadir - points) / np.linalg.norm(
+            nadir - points, axis=1, keepdims=True
         )
-        crosses = (side(a, b, near) * side(a, b, foot) < 0) & (
-            side(foot, near, a[None]) * side(foot, near, b[None]) < 0
+        crosses = (side(a, b, near) * side(a, b, nadir) < 0) & (
+            side(nadir, near, a[None]) * side(nadir, near, b[None]) < 0
         )
         ok &= ~crosses
     return ok

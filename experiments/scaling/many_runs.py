@@ -22,7 +22,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 
 from sofjax import slam
-from sofjax.observation import Observation
+from sofjax.extraction.observation import Observation
 
 TOGETHER = 16  # runs side by side on a core: what they work on then fits into its cache
 

@@ -1,8 +1,11 @@
 """Where the camera sits on the robot, from what it sees while driving."""
 
 from sofjax.calibration.fit import CalibrationResult as CalibrationResult
-from sofjax.calibration.fit import FitRules as FitRules
+from sofjax.calibration.fit import FitConfig as FitConfig
 from sofjax.calibration.fit import fit_mount as fit_mount
+from sofjax.calibration.fit_drive import DriveFit as DriveFit
+from sofjax.calibration.fit_drive import DriveFitConfig as DriveFitConfig
+from sofjax.calibration.fit_drive import fit_drive as fit_drive
 from sofjax.calibration.pairs import TURNS as TURNS
 from sofjax.calibration.pairs import UNKNOWNS as UNKNOWNS
 from sofjax.calibration.pairs import Estimate as Estimate
@@ -11,9 +14,6 @@ from sofjax.calibration.pairs import Pairs as Pairs
 from sofjax.calibration.pairs import distances as distances
 from sofjax.calibration.pairs import expected as expected
 from sofjax.calibration.pairs import start_at as start_at
-from sofjax.calibration.rounds import DriveFit as DriveFit
-from sofjax.calibration.rounds import DriveRules as DriveRules
-from sofjax.calibration.rounds import fit_drive as fit_drive
-from sofjax.calibration.tracks import TrackRules as TrackRules
+from sofjax.calibration.tracks import TrackConfig as TrackConfig
 from sofjax.calibration.tracks import follow as follow
 from sofjax.calibration.tracks import relate as relate

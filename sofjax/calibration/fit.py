@@ -21,7 +21,7 @@ from sofjax.smoothing.problem import robust
 MOUNT = ("height", "pitch", "roll")  # what is free unless told otherwise
 
 
-class FitRules(eqx.Module):
+class FitConfig(eqx.Module):
     """What is free, what is known beforehand, and when an answer is one."""
 
     free: tuple[str, ...] = eqx.field(static=True, default=MOUNT)  # of UNKNOWNS
@@ -34,9 +34,9 @@ class FitRules(eqx.Module):
     min_pairs: int = 20
 
 
-DEFAULT = FitRules()
+DEFAULT = FitConfig()
 ODOMETER = slice(4, None)  # of UNKNOWNS
-DOUBT = 2.0  # of `surprise`: three errors are together so far off by chance in 1 of 140 drives
+DOUBT = 2.0  # of `birge_ratio`: three errors are together so far off by chance in 1 of 140 drives
 
 
 class CalibrationResult(eqx.Module):
@@ -51,13 +51,13 @@ class CalibrationResult(eqx.Module):
     blindness: Float[Array, ""]  # ... and its standard deviation in the same; > 1 is no answer
     # how far off its prior the odometer had to be put, root mean square in sigmas, 1 at least: the
     # covariance is wider by it
-    surprise: Float[Array, ""]
+    birge_ratio: Float[Array, ""]
     cost: Float[Array, ""]  # half the sum of robust squares, in sigmas
     result: optx.RESULTS  # of the solver; an estimate that did not converge is the best so far
 
 
 def fit_mount(
-    camera: Camera, mount: Mount, pairs: Pairs, rules: FitRules = DEFAULT, max_steps: int = 60
+    camera: Camera, mount: Mount, pairs: Pairs, rules: FitConfig = DEFAULT, max_steps: int = 60
 ) -> CalibrationResult:
     """Find the mount that carries the floor's lines from image to image; Levenberg-Marquardt.
 
@@ -102,8 +102,8 @@ def _fit(
     )
     by = jnp.where(is_free, found.value, 0)
     estimate = start.moved(by)
-    surprise = _surprise(by[ODOMETER] / prior[ODOMETER], is_free[ODOMETER])
-    covariance = surprise**2 * _sandwich(residuals, by, pairs, prior, pixel_sigma)
+    birge_ratio = _birge_ratio(by[ODOMETER] / prior[ODOMETER], is_free[ODOMETER])
+    covariance = birge_ratio**2 * _sandwich(residuals, by, pairs, prior, pixel_sigma)
     covariance = jnp.where(is_free[:, None] & is_free, covariance, 0)
     spread, direction, sure = _blindness(limit, covariance)
     enough = jnp.sum(pairs.valid) >= min_pairs
@@ -117,7 +117,7 @@ def _fit(
         observable=is_free & sure & enough,
         blind=direction,
         blindness=spread,
-        surprise=surprise,
+        birge_ratio=birge_ratio,
         cost=0.5 * (jnp.sum(r**2) + jnp.sum(known**2)),
         result=found.result,
     )
@@ -164,7 +164,7 @@ def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "
     return root * jnp.maximum(values, independent) @ root.T
 
 
-def _surprise(off, is_free) -> Float[Array, ""]:
+def _birge_ratio(off, is_free) -> Float[Array, ""]:
     """How far values lie off their priors, root mean square in sigmas; 1 at least (Birge's ratio).
 
     What the clusters share, such as a wrong lens or clock, no covariance from their differences
@@ -181,7 +181,7 @@ def _blindness(limit, covariance):
     return spread, vectors[:, -1], jnp.diag(covariance) < limit**2
 
 
-def verdict(found: CalibrationResult, rules: FitRules, pairs: Pairs) -> tuple[bool, str]:
+def verdict(found: CalibrationResult, rules: FitConfig, pairs: Pairs) -> tuple[bool, str]:
     """Whether a fit is an answer, and in words what could not be observed."""
     count, limit = int(pairs.valid.sum()), rules.limit
     if count < rules.min_pairs:
@@ -205,11 +205,11 @@ def verdict(found: CalibrationResult, rules: FitRules, pairs: Pairs) -> tuple[bo
 
 def doubts(found: CalibrationResult) -> str:
     """What speaks against a fit that converged, in words; empty if nothing."""
-    surprise = float(found.surprise)
-    if surprise < DOUBT:
+    birge_ratio = float(found.birge_ratio)
+    if birge_ratio < DOUBT:
         return ""
     return (
-        f"it takes an odometer {surprise:.1f} times further off than odometers are, "
+        f"it takes an odometer {birge_ratio:.1f} times further off than odometers are, "
         "so camera, clock or odometer are not what they are taken for, and the errors told are "
         "wider by as much"
     )

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from sofjax import slam
+from sofjax.extraction.observation import Observation
 from sofjax.geometry.camera import Camera, Mount
-from sofjax.observation import Observation
-from sofjax.slam import SlamConfig
-from sofjax.smoothing import Path, Smoothed, SmoothingRules, smooth
+from sofjax.slam.step import SlamConfig
+from sofjax.smoothing import Path, Smoothed, SmoothingConfig, smooth
 
 WIDE = {"height": 0.3, "pitch": 0.1, "roll": 0.1, "yaw": 0.1}  # priors: heights, radians
 
@@ -21,7 +21,7 @@ def fit_jointly(
     mount: Mount,
     log: Observation,
     free: tuple[str, ...],
-    rules: SmoothingRules | None = None,
+    rules: SmoothingConfig | None = None,
 ) -> Smoothed:
     """Run the filter with a mount that is nearly right, then smooth the drive with it free.
 
@@ -32,7 +32,7 @@ def fit_jointly(
     - `mount`: nearly right, as `fit_drive` finds it.
     - `free`: of height, pitch, roll and yaw.
     """
-    rules = rules or SmoothingRules(rounds=1)  # more of them change nothing of the mount
+    rules = rules or SmoothingConfig(rounds=1)  # more of them change nothing of the mount
     config = eqx.tree_at(lambda c: c.motion.distance_scale_sigma, config, 0.0)
     unit = (float(mount.height), 1.0, 1.0, 1.0)
     sigma = tuple(

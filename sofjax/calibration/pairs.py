@@ -1,4 +1,4 @@
-"""Two sightings of one line, a baseline apart, and how far the mount lets them miss each other."""
+"""Two measurements of one line, a baseline apart, and how well the mount makes them agree."""
 
 import equinox as eqx
 import jax

@@ -9,17 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sofjax.calibration.pairs import Estimate, Pairs
+from sofjax.extraction.observation import Observation
+from sofjax.extraction.sof import below_horizon
 from sofjax.geometry.angles import wrap
 from sofjax.geometry.camera import Camera
 from sofjax.geometry.lines import cofactor, line_point_distance, line_through
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
 from sofjax.geometry.two_view import transfer_segment, two_view_homography
-from sofjax.observation import Observation
-from sofjax.sof import below_horizon
 
 
-class TrackRules(eqx.Module):
+class TrackConfig(eqx.Module):
     """When segments of images that follow one another are one line, and what makes a pair."""
 
     gate: float = 6.0  # pixels that an end may lie off where the line was to be expected
@@ -31,7 +31,7 @@ class TrackRules(eqx.Module):
 
 
 def follow(
-    rules: TrackRules, camera: Camera, estimate: Estimate, log: Observation
+    rules: TrackConfig, camera: Camera, estimate: Estimate, log: Observation
 ) -> Int[np.ndarray, "T M"]:
     """A number for every segment, the same for those that follow one another; -1 for none.
 
@@ -63,7 +63,7 @@ def follow(
 
 
 @eqx.filter_jit
-def _partners(rules: TrackRules, camera: Camera, estimate: Estimate, log: Observation):
+def _partners(rules: TrackConfig, camera: Camera, estimate: Estimate, log: Observation):
     """[T, M] for each lag: the segment so many images before that is the same line, or -1."""
     poses = path(jax.vmap(estimate.motion)(log.motion))
     floor = jax.vmap(below_horizon, in_axes=(None, None, 0))(
@@ -91,7 +91,7 @@ def _partners(rules: TrackRules, camera: Camera, estimate: Estimate, log: Observ
 
 
 def miss(
-    rules: TrackRules, H: Float[Array, "3 3"], first: Float[Array, "2 2"],
+    rules: TrackConfig, H: Float[Array, "3 3"], first: Float[Array, "2 2"],
     second: Float[Array, "2 2"],
 ) -> Float[Array, ""]:  # fmt: skip
     """How far the second's ends lie from where the first was to go, pixels; inf if another line."""
@@ -116,7 +116,7 @@ def path(motion: SE2) -> SE2:
 
 
 def relate(
-    rules: TrackRules,
+    rules: TrackConfig,
     log: Observation,
     track: Int[np.ndarray, "T M"],
     height: float,

@@ -74,20 +74,21 @@ def add_parser(parts: argparse._SubParsersAction) -> None:
 def run(args: argparse.Namespace) -> int:
     """Find the corners, fit, judge, draw, write."""
     from sofjax import viewer
-    from sofjax.cli import board_images, outputs
+    from sofjax.cli import board_images
     from sofjax.io.camera_file import known_mount, mount_fields
+    from sofjax.pipeline import run_folder
     from sofjax.vision.checkerboard import fit_camera, judge
 
     board = board_images.board(args)
     if args.out.is_dir():
         raise InputError(f"{args.out}: is a folder; -o must name a file, such as camera.yaml")
     figure = args.out.with_suffix(".png")
-    outputs.check_camera(args.out)
-    outputs.check_figure(figure)
+    run_folder.check_camera(args.out)
+    run_folder.check_figure(figure)
     mount = known_mount(args.out) if args.out.exists() else {}
     mount |= mount_fields("--mount", args.mount) if args.mount is not None else {}
     found = board_images.look(board_images.files(args.images), board)
-    outputs.check_writable(args.out.parent)
+    run_folder.check_writable(args.out.parent)
     try:
         fit = fit_camera(board, found.width, found.height, found.names, found.views)
     except ValueError as error:

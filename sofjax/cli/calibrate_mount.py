@@ -12,10 +12,10 @@ from sofjax.io.errors import InputError, nearest, quoted
 
 if TYPE_CHECKING:
     from sofjax.calibration import DriveFit
+    from sofjax.extraction.observation import Observation
     from sofjax.geometry import Mount
     from sofjax.io.camera_file import CameraFile
     from sofjax.io.drive import Drive
-    from sofjax.observation import Observation
     from sofjax.vision import Frontend, FrontendSettings
 
 REFUSED = 3  # exit code: all was read, and nothing can be known from it
@@ -64,8 +64,9 @@ def add_parser(parts: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, detect, fit, judge, draw, write."""
-    from sofjax.cli import mount_figure, outputs
+    from sofjax.cli import mount_figure
     from sofjax.io.drive import read_drive
+    from sofjax.pipeline import run_folder
     from sofjax.vision import FrontendSettings
 
     free = free_names(args.free)
@@ -74,10 +75,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out.is_dir():
         raise InputError(f"{args.out}: is a folder; -o must name a file, such as camera.yaml")
     figure = args.out.with_suffix(".png")
-    outputs.check_camera(args.out)
-    outputs.check_figure(figure)
+    run_folder.check_camera(args.out)
+    run_folder.check_figure(figure)
     drive = begin_at(read_drive(args.drive), args.initial)
-    outputs.check_writable(args.out.parent)
+    run_folder.check_writable(args.out.parent)
     found = calibrate(drive, FrontendSettings(), free, args.joint)
     print(found.summary)
     if found.usable:
@@ -91,15 +92,16 @@ def run(args: argparse.Namespace) -> int:
 
 def fit_before_run(drive: "Drive", settings: "FrontendSettings", folder: Path) -> "Calibration":
     """What `sofjax run --calibrate` does first; camera file and figure go into its folder."""
-    from sofjax.cli import mount_figure, outputs
+    from sofjax.cli import mount_figure
+    from sofjax.pipeline import run_folder
 
     found = calibrate(drive, settings, free_names(BY_DEFAULT))
     print(found.summary)
     if found.usable:
-        write(folder / outputs.CAMERA, found)
+        write(folder / run_folder.CAMERA, found)
     else:
         print("the drive is not run: measure the mount, or leave --calibrate out")
-    mount_figure.draw(folder / outputs.MOUNT, drive, found)
+    mount_figure.draw(folder / run_folder.MOUNT, drive, found)
     return found
 
 
@@ -162,10 +164,10 @@ def calibrate(
     import jax.numpy as jnp
     import numpy as np
 
-    from sofjax.calibration import TURNS, DriveRules, FitRules, fit_drive
+    from sofjax.calibration import TURNS, DriveFitConfig, FitConfig, fit_drive
+    from sofjax.calibration.assessment import SCALE, estimates
     from sofjax.calibration.fit import doubts
-    from sofjax.calibration.report import SCALE, estimates
-    from sofjax.doubts import fitted_height
+    from sofjax.pipeline.setup_checks import fitted_height
     from sofjax.vision import Frontend
 
     at = drive.odometry.at(drive.image_stamps)
@@ -178,7 +180,7 @@ def calibrate(
         )
     log = observed(drive, Frontend.of(drive, settings))
     # the odometer's turning errs more than anything; its distance is the measure of the height
-    rules = DriveRules(fit=FitRules(free=tuple(dict.fromkeys([*free, *TURNS]))))
+    rules = DriveFitConfig(fit=FitConfig(free=tuple(dict.fromkeys([*free, *TURNS]))))
     with jax.enable_x64(True):
         double = lambda leaf: jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
         camera, mount, log = jax.tree.map(
@@ -218,7 +220,7 @@ def calibrate(
         "pairs": pairs,
         "related": found.related,
         "residual_px": rms,
-        "surprise": float(found.fit.surprise),
+        "surprise": float(found.fit.birge_ratio),
         "starts_agreeing": found.agreeing,
         "before": {k: float(getattr(mount, k)) for k in FREE[:4]},
         "after": dict(zip(FREE[:4], values.tolist(), strict=True)),
@@ -248,7 +250,7 @@ def _jointly(camera, found: "DriveFit", log: "Observation", free: tuple[str, ...
     import numpy as np
 
     from sofjax.calibration.joint import fit_jointly
-    from sofjax.presets import PRESETS
+    from sofjax.slam.presets import PRESETS
 
     pairs = jax.device_get(found.fit.mount)
     mount = fit_jointly(PRESETS["default"], camera, found.fit.mount, log, free)

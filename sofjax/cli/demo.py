@@ -30,13 +30,13 @@ def run(args: argparse.Namespace) -> int:
     """Simulate, look, run, explain: each step is a command that can be given alone."""
     begun = time.perf_counter()
     from sofjax import viewer
-    from sofjax.cli import outputs
     from sofjax.cli.main import main
     from sofjax.io.text import write_atomically
+    from sofjax.pipeline import run_folder
 
     folder = args.out or Path("runs") / f"demo-{time.strftime('%Y%m%d-%H%M%S')}"
-    outputs.check_new(folder)
-    outputs.check_writable(folder)
+    run_folder.check_new(folder)
+    run_folder.check_writable(folder)
     drive, result = folder / "drive", folder / "run"
     steps = {
         "a robot is driven through a made-up corridor": [
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         code = main(command)
         if code:
             return code
-    report = json.loads((result / outputs.REPORT).read_text())
+    report = json.loads((result / run_folder.REPORT).read_text())
     write_atomically(folder / PAGE, page(report, drive, viewer.available()))
     print(f"\ndone in {time.perf_counter() - begun:.0f} s; look at {folder / PAGE}")
     return 0

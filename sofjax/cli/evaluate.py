@@ -18,7 +18,6 @@ def add_parser(commands: argparse._SubParsersAction) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from sofjax.cli import outputs
     from sofjax.cli.errors_table import errors_table
     from sofjax.evaluation import evaluate_map, evaluate_trajectory, shared
     from sofjax.io.drive import check_folder, read_odometry, read_truth
@@ -26,21 +25,22 @@ def run(args: argparse.Namespace) -> int:
     from sofjax.io.map_file import read_map
     from sofjax.io.odometry import mend
     from sofjax.io.trajectory import read_trajectory
+    from sofjax.pipeline import run_folder
 
     if not args.folder.is_dir():
         raise InputError(f"{args.folder}: there is no such folder; give one that a run has written")
-    drive = check_folder(args.drive or _drive_of(args.folder / outputs.REPORT))
+    drive = check_folder(args.drive or _drive_of(args.folder / run_folder.REPORT))
     truth, true_segments = read_truth(drive)
     if truth is None:
         raise InputError(
             f"{drive / 'groundtruth.txt'}: the true path is missing, and there is nothing to "
             "compare with"
         )
-    estimate = read_trajectory(args.folder / outputs.TRAJECTORY, "the trajectory of the run")
+    estimate = read_trajectory(args.folder / run_folder.TRAJECTORY, "the trajectory of the run")
     errors, motion = evaluate_trajectory(truth, estimate)
     smoothed, of_the_map = None, (estimate, motion)
-    if (args.folder / outputs.SMOOTHED).exists():
-        path = args.folder / outputs.SMOOTHED
+    if (args.folder / run_folder.SMOOTHED).exists():
+        path = args.folder / run_folder.SMOOTHED
         estimate = read_trajectory(path, "the smoothed trajectory of the run")
         smoothed, motion = evaluate_trajectory(truth, estimate)
         if not _map_is_driven(args.folder):
@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
         mended, _ = mend("odometry.txt", read.lines, read.trajectory)
         odometry, _ = evaluate_trajectory(truth, mended.at(estimate.stamps))
     of_map = None
-    if true_segments is not None and (args.folder / outputs.MAP).exists():
-        segments, _ = read_map(args.folder / outputs.MAP)
+    if true_segments is not None and (args.folder / run_folder.MAP).exists():
+        segments, _ = read_map(args.folder / run_folder.MAP)
         path, motion = of_the_map
         of_map = evaluate_map(true_segments, segments, motion, shared(truth, path).xy)
     print(f"{args.folder} of {drive.resolve().name}: {errors.path_m:.1f} m")
@@ -64,14 +64,14 @@ def run(args: argparse.Namespace) -> int:
 
 def _map_is_driven(folder: Path) -> bool:
     """Whether the run was killed before it wrote the map that goes with its smoothed trajectory."""
-    from sofjax.cli import outputs
     from sofjax.io.errors import InputError
     from sofjax.io.json_text import read_json
+    from sofjax.pipeline import run_folder
 
     try:
-        of_map = read_json(folder / outputs.REPORT, "the report of the run")["map"]
-        driven = of_map["of"] == outputs.TRAJECTORY
-        return driven and of_map["sha256"] == outputs.digest(folder / outputs.MAP)
+        of_map = read_json(folder / run_folder.REPORT, "the report of the run")["map"]
+        driven = of_map["of"] == run_folder.TRAJECTORY
+        return driven and of_map["sha256"] == run_folder.digest(folder / run_folder.MAP)
     except (OSError, InputError, LookupError, TypeError):
         return False
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import numpy as np
 
+    from sofjax.extraction.observation import Observation
     from sofjax.io.drive import Drive
-    from sofjax.observation import Observation
     from sofjax.vision import Frontend
 
 SHOWN = 6  # images in the figure
@@ -34,23 +34,23 @@ def run(args: argparse.Namespace) -> int:
     """Read, search all images, judge, draw."""
     import sys
 
-    from sofjax import doubts, viewer
-    from sofjax.cli import outputs
+    from sofjax import viewer
     from sofjax.io.drive import read_drive
-    from sofjax.presets import PRESETS
+    from sofjax.pipeline import run_folder, setup_checks
+    from sofjax.slam.presets import PRESETS
     from sofjax.vision import Frontend
 
     drive = read_drive(args.drive)
     frontend = Frontend.of(drive)
     out = args.out or Path("runs") / f"{drive.name}-inspect.png"
-    outputs.check_figure(out)
-    outputs.check_writable(out.parent)
+    run_folder.check_figure(out)
+    run_folder.check_writable(out.parent)
     seen = look(drive, frontend)
     print(describe(drive, seen))
     drive = dataclasses.replace(drive, remarks=drive.remarks + frontend.remarks)
-    warnings = doubts.of_drive(drive)
+    warnings = setup_checks.of_drive(drive)
     warnings += [f"{len(files)} images {fault}" for fault, files in seen.faults.items()]
-    wrong = drive.contradictions + doubts.set_up(PRESETS["default"], drive, seen.log)
+    wrong = drive.contradictions + setup_checks.set_up(PRESETS["default"], drive, seen.log)
     warnings += [doubt for doubt in wrong if doubt not in warnings]
     for warning in warnings:
         print(f"  warning   {warning}")
@@ -97,8 +97,8 @@ def look(drive: "Drive", frontend: "Frontend") -> Seen:
     import numpy as np
     from tqdm import tqdm
 
-    from sofjax.presets import PRESETS
-    from sofjax.sof import extract_along
+    from sofjax.extraction.sof import extract_along
+    from sofjax.slam.presets import PRESETS
     from sofjax.vision import observations
 
     files = tqdm(drive.image_files, desc=drive.name, unit=" images", disable=None)

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING
 from sofjax.cli import stopping
 
 if TYPE_CHECKING:
-    from sofjax.cli.settings import RunSettings
-    from sofjax.cli.tally import Tally
+    from sofjax.extraction.observation import Observation
     from sofjax.io.drive import Drive
-    from sofjax.observation import Observation
-    from sofjax.slam import SlamState, StepInfo
+    from sofjax.pipeline.settings import RunSettings
+    from sofjax.slam.step import SlamState, StepInfo
     from sofjax.vision import Frontend, View
 
 LOOPS = ("none", "paper", "smooth")
@@ -65,11 +64,12 @@ def run(args: argparse.Namespace) -> int:
     _drive_behind_set(args)
     begun = time.perf_counter()
 
-    from sofjax.cli import calibrate_mount, outputs
-    from sofjax.cli.settings import gather
+    from sofjax.cli import calibrate_mount
     from sofjax.io.drive import read_drive
     from sofjax.io.settings import to_dict, to_toml
     from sofjax.io.text import write_atomically
+    from sofjax.pipeline import run_folder
+    from sofjax.pipeline.settings import gather
     from sofjax.vision import Frontend
 
     settings = gather(args)
@@ -78,8 +78,8 @@ def run(args: argparse.Namespace) -> int:
     drive = dataclasses.replace(drive, remarks=drive.remarks + frontend.remarks)
     for contradiction in drive.contradictions:  # before it does harm
         print(f"sofjax: {contradiction}", file=sys.stderr)
-    with outputs.run_folder(args.out, drive.name, drive.path) as folder:
-        write_atomically(folder / outputs.CONFIG, to_toml(to_dict(settings)))
+    with run_folder.run_folder(args.out, drive.name, drive.path) as folder:
+        write_atomically(folder / run_folder.CONFIG, to_toml(to_dict(settings)))
         mount = None
         if args.calibrate:
             fitted = calibrate_mount.fit_before_run(drive, settings.frontend, folder)
@@ -109,10 +109,10 @@ def _run_into(
     - `mount`: what `--calibrate` found, if it was asked for.
     - `begun`: the clock when the command began.
     """
-    from sofjax.cli import report
-    from sofjax.cli.tally import Tally
+    from sofjax.pipeline import results as report
+    from sofjax.pipeline.run_log import RunLog
 
-    tally, seconds, closed, lapped = Tally(), {}, None, begun
+    run_log, seconds, closed, lapped = RunLog(), {}, None, begun
 
     def lap(name: str) -> None:
         nonlocal lapped
@@ -120,17 +120,17 @@ def _run_into(
         seconds[name], lapped = seconds.get(name, 0.0) + now - lapped, now
 
     def write(loop: str | None) -> report.Results:
-        results = report.write_results(folder, drive, tally, state, driven, closed, bool(early))
-        results.add_loop(settings.loop, loop)
-        report.write_report(folder, drive, settings, tally, results, seconds, mount)
+        results = report.write_results(folder, drive, run_log, state, driven, closed, bool(early))
+        report.add_loop(settings.loop, loop)
+        report.write_report(folder, drive, settings, run_log, results, seconds, mount)
         lap("write")
         return results
 
     lap("start")
     with stopping.held():
-        state, early = _drive(folder, drive, frontend, settings, tally)
+        state, early = _drive(folder, drive, frontend, settings, run_log)
         lap("drive")
-        tally.doubts = report.doubts_of(drive, settings, tally)
+        run_log.doubts = report.doubts_of(drive, settings, run_log)
         driven = report.driven_map(drive, settings, state)
         loop = None
         if settings.loop != "none":
@@ -143,24 +143,24 @@ def _run_into(
         if loop == report.UNFINISHED:
             try:
                 with stopping.allowed():
-                    from sofjax.cli.closing import close  # with optimistix, slow to import
+                    from sofjax.pipeline.finalize import close  # with optimistix, slow to import
 
-                    closed = close(drive, settings, tally, state, driven)
+                    closed = close(drive, settings, run_log, state, driven)
                 loop = report.SOLVED if closed else report.NOTHING
             except KeyboardInterrupt:
                 loop = report.INTERRUPTED
             lap("loop")
             results = write(loop)
         with stopping.allowed():
-            report.draw_figure(folder, drive, tally, results)
+            report.draw_figure(folder, drive, run_log, results)
         lap("write")
-        report.write_report(folder, drive, settings, tally, results, seconds, mount)
-    print(report.summary(folder, drive, tally, results, seconds))
+        report.write_report(folder, drive, settings, run_log, results, seconds, mount)
+    print(report.summary(folder, drive, run_log, results, seconds))
     return stopping.exit_code() if early or loop == report.INTERRUPTED else 0
 
 
 def _drive(
-    folder: Path, drive: "Drive", frontend: "Frontend", settings: "RunSettings", tally: "Tally"
+    folder: Path, drive: "Drive", frontend: "Frontend", settings: "RunSettings", run_log: "Tally"
 ) -> tuple["SlamState | None", KeyboardInterrupt | OSError | None]:
     """Take image after image, and write each one's pose.
 
@@ -168,12 +168,12 @@ def _drive(
     """
     from tqdm import tqdm
 
-    from sofjax.cli import outputs
     from sofjax.io.trajectory import TrajectoryWriter
+    from sofjax.pipeline import run_folder
 
     state, coming = None, steps(settings, drive, frontend)
     bar = tqdm(total=len(drive.image_files), desc=drive.name, unit="frame", disable=None)
-    with bar, TrajectoryWriter(folder / outputs.TRAJECTORY) as writer:
+    with bar, TrajectoryWriter(folder / run_folder.TRAJECTORY) as writer:
         while True:
             try:
                 with stopping.allowed():
@@ -183,13 +183,13 @@ def _drive(
             if done is None:
                 return state, None
             view, observed, info, seconds, state = done
-            tally.add(drive, view, observed, info, seconds, time.perf_counter())
+            run_log.add(drive, view, observed, info, seconds, time.perf_counter())
             try:
-                writer.write(tally.stamps[-1], tally.poses[-1][:2], tally.poses[-1][2])
+                writer.write(run_log.stamps[-1], run_log.poses[-1][:2], run_log.poses[-1][2])
             except OSError as error:
                 return state, error
             bar.update()
-            if len(tally.stamps) == 1:
+            if len(run_log.stamps) == 1:
                 bar.unpause()  # compiling is no part of the frames a second
 
 

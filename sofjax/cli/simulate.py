@@ -141,7 +141,7 @@ def choose_rig(args: argparse.Namespace) -> "Rig":
         "vibration": None if args.vibration is None else np.radians(args.vibration),
         "dropped": args.dropped,
     }
-    driven = {"speed": args.speed, "wobble": args.wobble}
+    driven = {"speed": args.speed, "wobble": args.jitter}
     return dataclasses.replace(
         rig,
         camera_file=webcam(mount, focal, width, height, distortion),

@@ -42,8 +42,8 @@ class Mount(eqx.Module):
         return Mount(*(jnp.asarray(value, float) for value in (x, y, height, pitch, roll, yaw)))
 
     @property
-    def T_robot_foot(self) -> SE2:
-        """The foot: the floor point under the optical centre, with the axes of the robot."""
+    def T_robot_nadir(self) -> SE2:
+        """The nadir: the floor point under the optical centre, with the axes of the robot."""
         xy = jnp.stack([self.x, self.y])
         return SE2(xy, jnp.zeros_like(self.x))
 
@@ -64,7 +64,7 @@ def projection_matrix(camera: Camera, mount: Mount, T_world_robot: SE2) -> Float
     **Returns:** P, scaled so that the third component of P X is the depth in metres.
     """
     R_world_camera = rotation_z(T_world_robot.yaw) @ rotation_robot_camera(mount)
-    C = jnp.append(T_world_robot.apply(mount.T_robot_foot.xy), mount.height)
+    C = jnp.append(T_world_robot.apply(mount.T_robot_nadir.xy), mount.height)
     R = R_world_camera.T
     return camera.K @ jnp.concatenate([R, -(R @ C)[:, None]], axis=1)
 

@@ -51,16 +51,16 @@ def floor_to_image(
 
 
 def may_be_upright(
-    foot_image: Float[Array, "3"],
+    nadir_image: Float[Array, "3"],
     segment_image: Float[Array, "2 2"],
     gate: Float[Array, ""] | float,
 ) -> Bool[Array, ""]:
-    """Whether a segment's ends are within `gate` pixels of a line through its middle and the foot.
+    """Whether a segment's ends are within `gate` pixels of a line through its middle and the nadir.
 
-    The image of the foot (homogeneous) is where the images of all uprights meet: an edge of a door
+    The image of the nadir (homogeneous) is where the images of all uprights meet: an edge of a door
     or a box always points there, and for a short way moves like a line of the floor.
     """
-    line = jnp.cross(foot_image, jnp.append(segment_image.mean(axis=0), 1))
+    line = jnp.cross(nadir_image, jnp.append(segment_image.mean(axis=0), 1))
     return jnp.abs(line_point_distance(line, segment_image[0])) < gate
 
 

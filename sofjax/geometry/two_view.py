@@ -23,9 +23,9 @@ def two_view_homography(camera: Camera, mount: Mount, T_first_second: SE2) -> Fl
     **Returns:** H in pixels.
     """
     T_second_first = T_first_second.inverse()
-    foot = mount.T_robot_foot.xy
+    nadir = mount.T_robot_nadir.xy
     R = rotation_z(T_second_first.yaw)  # R̄ of eq. (5)
-    t = T_second_first.apply(foot) - foot  # t̄ of eq. (5); its third component is 0
+    t = T_second_first.apply(nadir) - nadir  # t̄ of eq. (5); its third component is 0
     h, n = mount.height, jnp.array([0.0, 0.0, 1.0])  # eq. (6): n·X + h = 0
     R0 = rotation_robot_camera(mount).T
     body = R - jnp.outer(jnp.append(t, 0.0), n) / h  # eq. (7)

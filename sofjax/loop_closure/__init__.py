@@ -5,11 +5,12 @@ last metres among those of long ago, for every pose that the uncertainty allows;
 paper's closing, the error spread evenly back along the path.
 """
 
-from sofjax.loop_closure.constellation import Closing as Closing
-from sofjax.loop_closure.constellation import ClosingRules as ClosingRules
-from sofjax.loop_closure.constellation import find as find
-from sofjax.loop_closure.drives import ClosedDrive as ClosedDrive
-from sofjax.loop_closure.drives import close as close
+from sofjax.loop_closure.close import ClosedDrive as ClosedDrive
+from sofjax.loop_closure.close import close as close
+from sofjax.loop_closure.distribute_error import distribute as distribute
+from sofjax.loop_closure.place_recognition import Closing as Closing
+from sofjax.loop_closure.place_recognition import ClosingConfig as ClosingConfig
+from sofjax.loop_closure.place_recognition import find as find
 from sofjax.loop_closure.revisits import AGO as AGO
 from sofjax.loop_closure.revisits import Drive as Drive
 from sofjax.loop_closure.revisits import Revisit as Revisit
@@ -19,4 +20,3 @@ from sofjax.loop_closure.revisits import joined_map as joined_map
 from sofjax.loop_closure.revisits import moved_lines as moved_lines
 from sofjax.loop_closure.revisits import revisits as revisits
 from sofjax.loop_closure.revisits import solved as solved
-from sofjax.loop_closure.spreading import distribute as distribute

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 from sofjax.geometry.camera import Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-from sofjax.loop_closure.constellation import Closing, ClosingRules, find
-from sofjax.loop_closure.spreading import distribute
+from sofjax.loop_closure.distribute_error import distribute
+from sofjax.loop_closure.place_recognition import Closing, ClosingConfig, find
 from sofjax.segment_map import FinalMap, SegmentMap
 from sofjax.smoothing import Path, Smoothed
 
@@ -26,7 +26,7 @@ class Drive(eqx.Module):
     T_world_robot: SE2  # [T]
     sigma: Float[np.ndarray, "T 3"]  # standard deviations of x, y and yaw
     endpoints_world: Float[np.ndarray, "K 2 2"]
-    first: np.ndarray  # [K] image of the first sighting ...
+    first: np.ndarray  # [K] image of the first measurement ...
     last: np.ndarray  # ... and of the last; -1 for lines that are not to be used
 
     @property
@@ -38,9 +38,11 @@ class Drive(eqx.Module):
 def driven(path: Path, mount: Mount, segment_map: SegmentMap, final: FinalMap) -> Drive:
     """As the filter left it: of its drift no more is known than that it grows with the way."""
     T = jax.tree.map(lambda a: np.asarray(a, float), path.T_world_robot)
-    feet = np.asarray(jax.jit(lambda T, xy: T.apply(xy))(path.T_world_robot, mount.T_robot_foot.xy))
+    nadirs = np.asarray(
+        jax.jit(lambda T, xy: T.apply(xy))(path.T_world_robot, mount.T_robot_nadir.xy)
+    )
     anchors = np.asarray(segment_map.anchor.xy)
-    off = np.hypot(*np.moveaxis(anchors[:, None] - feet, -1, 0))
+    off = np.hypot(*np.moveaxis(anchors[:, None] - nadirs, -1, 0))
     off = off + np.abs(np.asarray(segment_map.anchor.yaw)[:, None] - T.yaw)
     use = np.asarray(final.is_floor)
     last = np.where(use, len(T.yaw) - 1 - np.asarray(segment_map.unseen), -1)
@@ -78,7 +80,7 @@ class Revisit(eqx.Module):
     lines: np.ndarray  # [P, 2] lines of the drive that are one: the later, the earlier
 
 
-def revisits(rules: ClosingRules, drive: Drive, images: np.ndarray | None = None) -> list[Revisit]:
+def revisits(rules: ClosingConfig, drive: Drive, images: np.ndarray | None = None) -> list[Revisit]:
     """Ask at each of some images, by default every few metres, whether the place was seen before.
 
     Lines that were seen both long ago and lately were found again already and ask for nothing.
@@ -134,22 +136,22 @@ def moved_lines(drive: Drive, motion: SE2) -> Float[Array, "K 2 2"]:
 
 def joined_map(smoothed: Smoothed, drive: Drive, motion: SE2, revisit: Revisit) -> SegmentMap:
     """The smoothed lines as a map to start from again, what was described twice only once."""
-    lines, K = smoothed.lines, len(smoothed.sightings)
+    lines, K = smoothed.lines, len(smoothed.measurements)
     later = np.zeros(K, bool)
     later[revisit.lines[:, 0]] = True
     with_first = jax.tree.map(lambda v: v[drive.first], motion)
     dtype = with_first.yaw.dtype
     cast = lambda tree: jax.tree.map(lambda v: jnp.asarray(v, dtype), tree)
-    kappa = np.zeros((K, 3, 3))
-    kappa[:, [0, 1, 2], [0, 1, 2]] = 1e-6
-    kappa[:, 2, 2] = smoothed.solution.kappa_sigma**2
+    apparent_scale = np.zeros((K, 3, 3))
+    apparent_scale[:, [0, 1, 2], [0, 1, 2]] = 1e-6
+    apparent_scale[:, 2, 2] = smoothed.solution.scale_sigma**2
     none = jnp.zeros(K, int)
     return SegmentMap(
         segments_world=Segments(moved_lines(drive, motion), jnp.asarray(lines.valid & ~later)),
         anchor=with_first @ cast(lines.anchor),
         line=cast(lines.line),
-        covariance=cast(kappa),
-        updates=jnp.asarray(smoothed.sightings),
+        covariance=cast(apparent_scale),
+        updates=jnp.asarray(smoothed.measurements),
         resting=none,
         unseen=none,
         expected=none,

@@ -9,18 +9,18 @@ eliminated there (`dissection`, `elimination`), however often places are passed 
 `solve` is one solution for associations that are given; `smooth` finds the associations as well.
 """
 
-from sofjax.smoothing.lines import Lines as Lines
-from sofjax.smoothing.lines import Seeing as Seeing
+from sofjax.smoothing.association.lines import Lines as Lines
+from sofjax.smoothing.association.lines import Seeing as Seeing
 from sofjax.smoothing.problem import Keyframes as Keyframes
 from sofjax.smoothing.problem import Priors as Priors
 from sofjax.smoothing.problem import Problem as Problem
 from sofjax.smoothing.problem import Unknowns as Unknowns
 from sofjax.smoothing.problem import residuals as residuals
 from sofjax.smoothing.problem import robust as robust
-from sofjax.smoothing.rounds import Path as Path
-from sofjax.smoothing.rounds import Smoothed as Smoothed
-from sofjax.smoothing.rounds import SmoothingRules as SmoothingRules
-from sofjax.smoothing.rounds import final_map as final_map
-from sofjax.smoothing.rounds import smooth as smooth
+from sofjax.smoothing.smoother import Path as Path
+from sofjax.smoothing.smoother import Smoothed as Smoothed
+from sofjax.smoothing.smoother import SmoothingConfig as SmoothingConfig
+from sofjax.smoothing.smoother import final_map as final_map
+from sofjax.smoothing.smoother import smooth as smooth
 from sofjax.smoothing.solution import Solution as Solution
 from sofjax.smoothing.solution import solve as solve

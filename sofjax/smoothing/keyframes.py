@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sofjax.extraction.observation import Observation
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 from sofjax.motion import way_of
-from sofjax.observation import Observation
 from sofjax.smoothing.problem import Keyframes
 
 PAD = 64  # sizes are rounded up from here on, so that drives share compiled programs

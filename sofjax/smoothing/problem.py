@@ -12,7 +12,7 @@ from sofjax.geometry.lines import cofactor, line_point_distance
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 from sofjax.motion import MotionModel, odometer_sigma, prior_bias, read_twist
-from sofjax.segment_map import appear
+from sofjax.segment_map import predict_measurement
 
 POSE, LINE, SHARED = 5, 3, 8  # unknowns of a keyframe, of a line, and of the whole drive
 
@@ -36,8 +36,8 @@ class Keyframes(eqx.Module):
 class Unknowns(eqx.Module):
     """What is solved for."""
 
-    pose: Float[Array, "n 5"]  # x, y, yaw in the world, and the wobble (pitch, roll) of the moment
-    line: Float[Array, "K 3"]  # (rho, theta, kappa) about each line's anchor
+    pose: Float[Array, "n 5"]  # x, y, yaw in the world, and the jitter (pitch, roll) of the moment
+    line: Float[Array, "K 3"]  # (rho, theta, apparent scale) about each line's anchor
     shared: Float[Array, "8"]  # corrections of height, pitch, roll, yaw; the odometer's errors b
 
 
@@ -48,7 +48,7 @@ class Priors(eqx.Module):
     loss_scale: float = 3.0  # residuals, in sigmas, from which they count linearly only
     tilt_sigma: float = 0.001  # radians
     mount_sigma: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # height, pitch, roll, yaw
-    kappa_sigma: float = 0.3  # of a line that is not on the floor
+    scale_sigma: float = 0.3  # of a line that is not on the floor
 
 
 LEAST = 1e-3  # metres or radians: keyframes have moved by much more
@@ -63,8 +63,8 @@ class Problem(eqx.Module):
     motion_model: MotionModel
     priors: Priors
     keyframes: Keyframes
-    anchor: SE2  # [K] T_world_foot in which each line is described
-    raised: Bool[Array, "K"]  # lines whose kappa is free
+    anchor: SE2  # [K] T_world_nadir in which each line is described
+    off_floor: Bool[Array, "K"]  # lines whose apparent scale is free
     start: Unknowns  # the first pose stays; lines that nobody sees stay
 
 
@@ -92,7 +92,7 @@ def corrected(mount: Mount, shared: Float[Array, "8"]) -> Mount:
 
 
 def foot_mount(mount: Mount, pose: Float[Array, "5"]) -> Mount:
-    """The mount about the foot, with the wobble of a keyframe."""
+    """The mount about the nadir, with the jitter of a keyframe."""
     zero = jnp.zeros_like(mount.height)
     return Mount(zero, zero, mount.height, mount.pitch + pose[3], mount.roll + pose[4], mount.yaw)
 
@@ -107,8 +107,8 @@ def pixel_residual(
 ) -> Float[Array, "2"]:
     """Distances of a segment's end points from its line, l = H_F^-T L, in pixels."""
     mount = corrected(problem.mount, shared)
-    T_world_foot = SE2(pose[:2], pose[2]) @ mount.T_robot_foot
-    seen, _ = appear(line, anchor, T_world_foot)
+    T_world_nadir = SE2(pose[:2], pose[2]) @ mount.T_robot_nadir
+    seen, _ = predict_measurement(line, anchor, T_world_nadir)
     L = jnp.stack([-jnp.sin(seen[1]), jnp.cos(seen[1]), -seen[0]])
     H_F = floor_homography(problem.camera, foot_mount(mount, pose), SE2.identity())
     l = cofactor(H_F) @ L
@@ -163,9 +163,9 @@ def residuals(unknowns: Unknowns, problem: Problem) -> Residuals:
         problem, unknowns.pose[:-1], unknowns.pose[1:], unknowns.shared, *read
     )
     first = (unknowns.pose[:1, :3] - problem.start.pose[:1, :3]) / 1e-4
-    kappa_sigma = jnp.where(problem.raised, priors.kappa_sigma, FIXED)
-    loose = jnp.full_like(kappa_sigma, 10.0)  # keeps a line that nobody sees where it is
-    line_sigma = jnp.stack([loose, loose, kappa_sigma], axis=1)
+    scale_sigma = jnp.where(problem.off_floor, priors.scale_sigma, FIXED)
+    loose = jnp.full_like(scale_sigma, 10.0)  # keeps a line that nobody sees where it is
+    line_sigma = jnp.stack([loose, loose, scale_sigma], axis=1)
     centre = problem.start.line.at[:, 2].set(1)
     bias_sigma = jnp.sqrt(jnp.diag(prior_bias(problem.motion_model).covariance))
     shared_sigma = jnp.concatenate([jnp.asarray(priors.mount_sigma), bias_sigma])

@@ -8,11 +8,11 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.segment_map import on_floor
-from sofjax.smoothing.blocks import Jacobian
-from sofjax.smoothing.dissection import Dissection, dissect, divide
-from sofjax.smoothing.elimination import DissectionSolver, eliminate
-from sofjax.smoothing.marginals import Marginals, marginals
 from sofjax.smoothing.problem import Problem, Residuals, Unknowns, residuals
+from sofjax.smoothing.sparse.blocks import Jacobian
+from sofjax.smoothing.sparse.dissection import Dissection, dissect, divide
+from sofjax.smoothing.sparse.elimination import DissectionSolver, eliminate
+from sofjax.smoothing.sparse.marginals import Marginals, marginals
 
 TOLERANCE = 1e-4  # metres and radians
 MISFIT = 1e-3  # standard deviations, root mean square, by which it changes the residuals
@@ -37,8 +37,10 @@ class Solution(eqx.Module):
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
     marginals: Marginals
-    kappa_free: Float[Array, "K"]  # each line's kappa if it alone were free, poses held ...
-    kappa_sigma: Float[Array, "K"]  # ... and its standard deviation
+    scale_free: Float[
+        Array, "K"
+    ]  # each line's apparent scale if it alone were free, poses held ...
+    scale_sigma: Float[Array, "K"]  # ... and its standard deviation
     on_floor: Float[Array, "K 3"]  # each line if it alone were free, but on the floor
 
     @property
@@ -96,10 +98,10 @@ def _solve(
     J, frames = Jacobian.of(jvp, unknowns), problem.keyframes
     blocks = J.blocks(frames, 0.0)
 
-    # each line alone about the poses found, kappa free and then 1
+    # each line alone about the poses found, the apparent scale free and then 1
     _, gradient = J.transposed(frames, r)
-    weak = jnp.diag(jnp.array([1e-2, 1e-2, 1 / problem.priors.kappa_sigma**2]))
-    alone = jnp.linalg.inv(blocks.sighted + weak)
+    weak = jnp.diag(jnp.array([1e-2, 1e-2, 1 / problem.priors.scale_sigma**2]))
+    alone = jnp.linalg.inv(blocks.measured + weak)
     free = unknowns.line - jnp.einsum("kij,kj->ki", alone, gradient)
     return Solution(
         unknowns=unknowns,
@@ -108,8 +110,8 @@ def _solve(
         steps=found.stats["num_steps"],
         converged=found.result == optx.RESULTS.successful,
         marginals=_if(sure, lambda: marginals(eliminate(blocks, dissection))),
-        kappa_free=free[:, 2],
-        kappa_sigma=jnp.sqrt(alone[:, 2, 2]),
+        scale_free=free[:, 2],
+        scale_sigma=jnp.sqrt(alone[:, 2, 2]),
         on_floor=jax.vmap(on_floor)(free, alone),
     )
 

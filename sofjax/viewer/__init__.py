@@ -6,4 +6,4 @@ from sofjax.viewer.figures import available as available
 from sofjax.viewer.figures import draw_images as draw_images
 from sofjax.viewer.figures import draw_map as draw_map
 from sofjax.viewer.mount import draw_mount as draw_mount
-from sofjax.viewer.sheet import SIGNATURE as SIGNATURE
+from sofjax.viewer.style import SIGNATURE as SIGNATURE

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sofjax.viewer.sheet import line_drawer, new_figure, save
+from sofjax.viewer.style import line_drawer, new_figure, save
 
 USED, DROPPED = "#1f4e9c", "#d4447c"
 ARROW = 0.04  # of the image's width, that the largest usual residual is drawn

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sofjax.viewer.sheet import line_drawer, new_figure, save
+from sofjax.viewer.style import line_drawer, new_figure, save
 
 MISSING = "matplotlib is not installed, so there is no figure: pip install 'sofjax[figures]'"
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sofjax.viewer.sheet import new_figure, save
+from sofjax.viewer.style import new_figure, save
 
 OLD, NEW = "#d4447c", "#1f4e9c"
 

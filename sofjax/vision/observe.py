@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Segments
 from sofjax.io.drive import Drive, motion_sigmas, motions
-from sofjax.observation import Observation
 from sofjax.vision.frontend import REPEATED, Frontend, View
 
 MOVED_XY, MOVED_YAW = 0.01, 0.01  # metres and radians, beyond which an image cannot stay the same

@@ -1,0 +1,1 @@
+"""Images of a world, by tracing rays."""

@@ -1,0 +1,1 @@
+"""Segments of a world as a detector would find them, without images."""

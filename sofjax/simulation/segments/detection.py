@@ -1,0 +1,149 @@
+"""What a line detector makes of the edges that are in view, and how it errs.
+
+A line of some millimetres is seen as its two edges. It is w pixels broad in the image, less the
+farther it is, and a blur of standard deviation b leaves the share erf(w / √8 b) of its contrast:
+it fades with distance. The two slopes that are left have their middles w / share apart, on either
+side of the line: that is √(2π) b for the finest line and w for a broad one.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from sofjax.geometry.angles import safe_divide, safe_norm
+from sofjax.geometry.camera import Camera
+from sofjax.simulation.segments.visibility import NEAREST_DEPTH, project, where_positive
+
+FALSE_SLOTS = 8  # false segments of an image at most
+
+
+class Detection(eqx.Module):
+    """How a line detector errs; the defaults are those of LSD on 320×240 pixels.
+
+    `blur` and the contrasts were found on drawn images of fine lines; that the filter errs on such
+    segments as on the images of the same drives is shown by `experiments/ablation`.
+    """
+
+    noise: float = 0.25  # pixels, standard deviation of an end across the line
+    shortening: float = 1.5  # pixels that an end is short of the edge's, mean size
+    missed: float = 0.1  # share of edges of good contrast that are not seen
+    least_contrast: float = 0.04  # step of brightness below which no edge is seen
+    full_contrast: float = 0.1  # ... and from which its contrast is good; between, in proportion
+    blur: float = 1.05  # pixels, standard deviation: lens, pixels and detector together
+    broken: float = 0.25  # share of edges that come in two pieces
+    false_segments: float = 2.0  # mean number an image
+    shortest: float = 15.0  # pixels
+    max_depth: float = 10.0  # metres
+
+
+LSD = Detection()
+
+
+def break_up(
+    segment: Float[Array, "2 2"], draws: Float[Array, "3"], broken: Float[Array, ""] | float
+) -> tuple[Float[Array, "2 2 2"], Bool[Array, "2"]]:
+    """One piece, or two with a gap, and which of the two are there; by three draws from 0 to 1."""
+    chance, place, gap = draws
+    breaks = chance < broken
+    middle = 0.2 + 0.6 * place
+    ends = jnp.stack([middle * (1 - 0.2 * gap), middle + (1 - middle) * 0.2 * gap])
+    inner = segment[None, 0] + ends[:, None] * (segment[1] - segment[0])[None]
+    first = jnp.stack([segment[0], jnp.where(breaks, inner[0], segment[1])])
+    return jnp.stack([first, jnp.stack([inner[1], segment[1]])]), jnp.stack([breaks | True, breaks])
+
+
+def breadth_in_image(
+    homogeneous: Float[Array, "2 3"],
+    edge_world: Float[Array, "2 3"],
+    width: Float[Array, ""],
+    P: Float[Array, "3 4"],
+) -> Float[Array, ""]:
+    """How broad a floor line of some width is in the image, as pixels × metres of depth.
+
+    Across a straight line in the image this is the same all along it.
+    """
+    line = jnp.cross(homogeneous[0], homogeneous[1])
+    across = jnp.append(normal_of(edge_world[:, :2]), 0)
+    return width * jnp.abs(safe_divide(line @ (P[:, :3] @ across), safe_norm(line[:2])))
+
+
+def share_left(w: Float[Array, "*any"], blur: Float[Array, ""] | float) -> Float[Array, "*any"]:
+    """Share of its contrast that a line `w` pixels broad keeps when blurred."""
+    return jax.scipy.special.erf(w / (8**0.5 * blur))
+
+
+def seen_until(
+    breadth: Float[Array, "*#any"],
+    contrast: Float[Array, "*#any"],
+    wanted: Float[Array, "*#any"] | Float[Array, ""] | float,
+    detection: Detection,
+) -> Float[Array, "*#any"]:
+    """Depth in metres at which an edge's contrast falls to what is wanted; 0 if it is less at once.
+
+    A line without breadth is an edge that does not fade, seen to `max_depth`.
+    """
+    least = 8**0.5 * detection.blur * jax.scipy.special.erfinv(safe_divide(wanted, contrast))
+    fades = jnp.where(breadth > 0, breadth / jnp.maximum(least, 1e-6), jnp.inf)
+    return jnp.where(wanted < contrast, jnp.minimum(fades, detection.max_depth), 0)
+
+
+def both_edges(
+    homogeneous: Float[Array, "2 3"],
+    part: Float[Array, "2"],
+    breadth: Float[Array, ""],
+    reach: Float[Array, "2"],
+    blur: Float[Array, ""] | float,
+) -> tuple[Float[Array, "2 2 2"], Bool[Array, "2"]]:
+    """The two edges of a fine line, beside its middle in the image, and which of them are there.
+
+    They run in opposite directions, as with the darker side on one hand.
+
+    **Arguments:**
+    - `part`: shares (from, to) of the line that are in view.
+    - `reach`: depth in metres to which either edge is seen.
+    """
+    depth = homogeneous[:, 2]
+
+    def edge(reach: Float[Array, ""], side: Float[Array, ""]) -> tuple[Array, Array]:
+        near = where_positive(reach - depth)
+        seen = jnp.stack([jnp.maximum(part[0], near[0]), jnp.minimum(part[1], near[1])])
+        ends = project(homogeneous, seen)
+        w = breadth / jnp.maximum(depth[0] + seen * (depth[1] - depth[0]), NEAREST_DEPTH)
+        away = jnp.maximum(w, 1e-3) / share_left(jnp.maximum(w, 1e-3), blur) / 2
+        return ends + side * away[:, None] * normal_of(ends)[None], seen[1] > seen[0]
+
+    ends, there = jax.vmap(edge)(reach, jnp.array([1.0, -1.0]))
+    return jnp.stack([ends[0], ends[1, ::-1]]), there
+
+
+def normal_of(segment: Float[Array, "2 2"]) -> Float[Array, "2"]:
+    """The unit vector across a segment; zero if it has no length."""
+    d = segment[1] - segment[0]
+    return safe_divide(jnp.stack([-d[1], d[0]]), jnp.broadcast_to(safe_norm(d), (2,)))
+
+
+def invent(
+    camera: Camera, detection: Detection, key: PRNGKeyArray
+) -> tuple[Float[Array, "false 2 2"], Bool[Array, "false"]]:
+    """Segments of nothing, anywhere in the picture and in any direction."""
+    count_key, place_key, angle_key, length_key = jax.random.split(key, 4)
+    there = jax.random.uniform(count_key, (FALSE_SLOTS,)) < detection.false_segments / FALSE_SLOTS
+    size = jnp.array([camera.width - 1, camera.height - 1], float)
+    middle = jax.random.uniform(place_key, (FALSE_SLOTS, 2)) * size[None]
+    angle = jax.random.uniform(angle_key, (FALSE_SLOTS,)) * jnp.pi
+    half = detection.shortest / 2 + 10 * jax.random.exponential(length_key, (FALSE_SLOTS,))
+    reach = half[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    ends = jnp.stack([middle - reach, middle + reach], axis=1)
+    return jnp.clip(ends, 0, size[None, None]), there
+
+
+def disturb(
+    segment: Float[Array, "2 2"], draws: Float[Array, "2 2"], detection: Detection
+) -> Float[Array, "2 2"]:
+    """Noise across the line at both ends, and each end drawn in along it; by normal draws."""
+    across, along = draws
+    normal = normal_of(segment)
+    unit = jnp.stack([normal[1], -normal[0]])
+    short = jnp.abs(along) * jnp.array([1.0, -1.0]) * detection.shortening
+    return segment + detection.noise * across[:, None] * normal[None] + short[:, None] * unit[None]

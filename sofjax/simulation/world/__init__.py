@@ -1,0 +1,1 @@
+"""Worlds: what stands on a floor, where, and how it looks."""

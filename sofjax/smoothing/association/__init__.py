@@ -1,0 +1,1 @@
+"""Which segment shows which line, and which lines are one."""

@@ -1,0 +1,1 @@
+"""The linear algebra of the joint solution: sparse blocks and nested dissection."""
