@@ -128,8 +128,8 @@ def run_batch(config, camera, mount, observations, keys) -> slam.StepInfo:
     """The filter on every drive of a batch, each with its key; infos [drives, T]."""
 
     def one(camera, mount, observations, key):
-        state = slam.init(config, camera, mount, key, M)
-        return slam.run(config, camera, mount, state, observations)[1]
+        state = SofSlam(config, camera, mount).init(key, M)
+        return SofSlam(config, camera, mount).run(state, observations)[1]
 
     return jax.vmap(one)(camera, mount, observations, keys)
 

@@ -30,9 +30,12 @@ _HOME = {  # in reading order
     "Association": "sofjax.extraction",
     "MotionModel": "sofjax.motion",
     "SensorModel": "sofjax.likelihood",
+    "LineNoise": "sofjax.likelihood",
     "MapConfig": "sofjax.segment_map",
     "FilterConfig": "sofjax.slam",
     "SlamConfig": "sofjax.slam",
+    "SofSlam": "sofjax.slam",
+    "pose_log_likelihood": "sofjax.slam",
     "PRESETS": "sofjax.slam",
 }
 _MODULES = (

@@ -99,7 +99,7 @@ def resample_observable(
     )
 
 
-def winner(log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
+def most_likely(log_weight: Float[Array, "N"]) -> Int[Array, "N"]:
     """The paper's choice: the single most likely particle, N times."""
     return jnp.full(log_weight.shape, jnp.argmax(log_weight))
 

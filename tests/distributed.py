@@ -10,7 +10,7 @@ import pytest
 import test_slam
 from conftest import jit_quickly
 
-from sofjax import log_likelihood, slam
+from sofjax import SofSlam, log_likelihood, slam
 from sofjax.geometry import SE2, Segments
 
 T, N = 12, test_slam.N
@@ -27,12 +27,14 @@ def main():
             lambda a: a.astype(float) if a.dtype == "float32" else a, given
         )
         log = jax.tree.map(lambda a: a[:T], log)
-        run = jit_quickly(slam.run.__wrapped__)
-        state = slam.init(test_slam.CONFIG, camera, mount, jax.random.key(0), test_slam.M)
-        here = run(test_slam.CONFIG, camera, mount, state, log)
+        run = jit_quickly(SofSlam.run.__wrapped__)
+        state = SofSlam(test_slam.CONFIG, camera, mount).init(jax.random.key(0), test_slam.M)
+        here = run(SofSlam(test_slam.CONFIG, camera, mount), state, log)
         everywhere = jax.device_put((camera, mount), copied)
         there = run(
-            test_slam.CONFIG, *everywhere, slam.distribute(state, mesh), jax.device_put(log, copied)
+            SofSlam(test_slam.CONFIG, *everywhere),
+            slam.shard(state, mesh),
+            jax.device_put(log, copied),
         )
         assert there[0].particles.T_world_robot.xy.sharding.is_equivalent_to(shared, 2)
         assert there[1].matched[-1] > 3 and there[1].effective_size.min() < N / 2  # resampled
@@ -41,7 +43,7 @@ def main():
 
     three = jax.make_mesh((3,), ("particles",), axis_types=AUTO, devices=jax.devices()[:3])
     with pytest.raises(ValueError, match="64 particles cannot be shared alike by 3 devices"):
-        slam.distribute(test_slam.start(), three)
+        slam.shard(test_slam.start(), three)
 
     rng = np.random.default_rng(0)
     middles = rng.uniform(-4, 4, size=(100, 1, 2))

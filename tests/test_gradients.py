@@ -34,8 +34,9 @@ from sofjax.geometry import (
 from sofjax.geometry.lines import line_point_distance, polar_in_frame, polar_through
 from sofjax.geometry.segments import clip
 from sofjax.geometry.two_view import transfer_segment
-from sofjax.likelihood.measurements import Measurements, SensorModel, measure
-from sofjax.likelihood.tracking import Candidates, compare, pair
+from sofjax.likelihood.measurements import Measurements, measure
+from sofjax.likelihood.sensor_model import SensorModel
+from sofjax.likelihood.tracking import Candidates, precompute, score
 from sofjax.motion import MotionModel, prior_bias, sample_motion, sample_slip
 from sofjax.segment_map import MapConfig, posterior_given_class, predict_measurement
 
@@ -345,7 +346,7 @@ SEGMENTS = np.array(
 def measured(p, sensor):
     segments = Segments(p[6:].reshape(-1, 2, 2), jnp.ones((len(p) - 6) // 4, bool))
     found = measure(sensor, make_camera(), mount_of(p[:6]), segments, 8.0)
-    return found.line, found.covariance, found.tilt, found.endpoints_nadir
+    return found.line, found.covariance, found.by_jitter, found.endpoints_nadir
 
 
 def measured_by_default(p):
@@ -395,8 +396,8 @@ def likelihood(p, sensor):
         line, jnp.ones((4, 2)) + p[11], W, W, jnp.broadcast_to(valid > 0.5, (4, 2))
     )
     used = jnp.broadcast_to(used > 0.5, 4)
-    found = compare(sensor, pair(measurements, candidates), pose_of(p[:3]), used)
-    return found.log_likelihood, found.tilt
+    found = score(sensor, precompute(measurements, candidates), pose_of(p[:3]), used)
+    return found.log_likelihood, found.jitter
 
 
 def likelihood_by_default(p):
@@ -447,7 +448,7 @@ def test_gradients_with_some_segments_masked_are_those_of_the_others():
     @jit_quickly
     @jax.grad
     def gradient(p, measurements, lines, used):
-        return compare(sensor, pair(measurements, lines), pose_of(p), used).log_likelihood
+        return score(sensor, precompute(measurements, lines), pose_of(p), used).log_likelihood
 
     mask = jnp.isin(jnp.arange(4), keep)
     fewer = jax.tree.map(lambda a: a[keep], (found, lines))
@@ -478,8 +479,8 @@ def test_padding_of_any_finite_precision_does_not_spread():
     )
 
     def f(p):
-        found_here = compare(SensorModel(), pair(found, lines), pose_of(p), jnp.ones(2, bool))
-        return found_here.log_likelihood, found_here.tilt
+        found_here = score(SensorModel(), precompute(found, lines), pose_of(p), jnp.ones(2, bool))
+        return found_here.log_likelihood, found_here.jitter
 
     assert_finite(f, [0.1, 0.2, 0.1])
 

@@ -9,15 +9,16 @@ import reference
 from conftest import jit_quickly
 
 from sofjax.geometry import SE2, PolarLine
-from sofjax.likelihood.measurements import Measurements, SensorModel
+from sofjax.likelihood.measurements import Measurements
+from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.likelihood.tracking import (
     Candidates,
-    adapt_noise,
-    compare,
+    adapt_inflation,
     mahalanobis,
     nothing_seen,
-    pair,
     pixels_and_weight,
+    precompute,
+    score,
 )
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -25,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 
 @jit_quickly
 def compare_pose(sensor, measurements, candidates, T_predicted_nadir, used):
-    return compare(sensor, pair(measurements, candidates), T_predicted_nadir, used)
+    return score(sensor, precompute(measurements, candidates), T_predicted_nadir, used)
 
 
 def pose(x, y, yaw):
@@ -44,16 +45,18 @@ def random_problem(rng, M=6, C=4):
     return near, lines, apparent_scale, W, rng.random((M, C)) < 0.8
 
 
-def as_arrays(near, lines, apparent_scale, W, valid, tilt=None, sigma=0.0):
+def as_arrays(near, lines, apparent_scale, W, valid, by_jitter=None, sigma=0.0):
     M = len(near)
-    tilt = np.zeros((M, 2, 2)) if tilt is None else tilt
-    loose = np.linalg.inv(np.linalg.inv(W) + sigma**2 * (tilt @ np.swapaxes(tilt, 1, 2))[:, None])
+    by_jitter = np.zeros((M, 2, 2)) if by_jitter is None else by_jitter
+    loose = np.linalg.inv(
+        np.linalg.inv(W) + sigma**2 * (by_jitter @ np.swapaxes(by_jitter, 1, 2))[:, None]
+    )
     measurements = Measurements(
         endpoints_nadir=jnp.zeros((M, 2, 2)),
         valid=jnp.ones(M, bool),
         line=PolarLine(jnp.asarray(near[:, 0]), jnp.asarray(near[:, 1])),
         covariance=jnp.broadcast_to(jnp.eye(2), (M, 2, 2)),
-        tilt=jnp.asarray(tilt),
+        by_jitter=jnp.asarray(by_jitter),
     )
     candidates = Candidates(
         PolarLine(jnp.asarray(lines[..., 0]), jnp.asarray(lines[..., 1])),
@@ -104,7 +107,7 @@ def test_the_likelihood_is_the_loop_over_all_pairs(rng):
         own = [[] if not may else some for may, some in zip(used, as_lists(*rest), strict=True)]
         expected = reference.log_likelihood(near, [True] * len(near), own, STIFF.e_max, T)
         assert found.log_likelihood == pytest.approx(expected, rel=1e-9)
-        np.testing.assert_array_equal(found.tilt, 0)
+        np.testing.assert_array_equal(found.jitter, 0)
         inliers += int((found.error < STIFF.e_max).sum())
     assert inliers > 10
 
@@ -134,7 +137,7 @@ def test_the_jitter_is_the_one_that_costs_least(rng):
             return total
 
         best = reference.best_jitter(cost, sensor.tilt_sigma)
-        np.testing.assert_allclose(found.tilt, best, atol=1e-6)
+        np.testing.assert_allclose(found.jitter, best, atol=1e-6)
         assert (found.error[1:] < sensor.e_max).all()
         assert found.log_likelihood == pytest.approx(-cost(best) / 2, rel=1e-6)
 
@@ -182,7 +185,7 @@ def test_what_is_not_valid_counts_nothing_and_what_may_not_match_costs_the_most(
         jnp.asarray(mask),
         measurements.line,
         measurements.covariance,
-        measurements.tilt,
+        measurements.by_jitter,
     )
     invalid = compare_pose(STIFF, padded, candidates, SE2.identity(), jnp.ones(6, bool))
     assert invalid.log_likelihood == pytest.approx(expected)
@@ -195,7 +198,7 @@ def test_where_nothing_lies_on_the_floor_the_answer_is_known_without_comparing(r
     measurements, candidates = as_arrays(*random_problem(rng))
     measurements = eqx.tree_at(lambda s: s.valid, measurements, jnp.zeros(6, bool))
     found = compare_pose(STIFF, measurements, candidates, pose(0.1, 0.2, 0.3), jnp.zeros(6, bool))
-    known = nothing_seen(STIFF, pair(measurements, candidates))
+    known = nothing_seen(STIFF, precompute(measurements, candidates))
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(known), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
@@ -252,7 +255,9 @@ def test_mahalanobis_is_the_matrix_product(rng):
 
 def test_noise_is_taken_where_matches_disagree_and_never_below_the_model():
     sensor = SensorModel(adaptation=0.5)
-    noise = lambda before, misfit: float(adapt_noise(sensor, jnp.array(before), jnp.array(misfit)))
+    noise = lambda before, misfit: float(
+        adapt_inflation(sensor, jnp.array(before), jnp.array(misfit))
+    )
     assert noise(1.0, 2.0) == 1
     assert noise(3.0, 2.0) == pytest.approx(3)
     assert noise(1.0, 4.0) == pytest.approx(np.exp(0.5))

@@ -12,7 +12,8 @@ from conftest import jit_quickly
 
 from sofjax.geometry import SE2, Mount, PolarLine, Segments
 from sofjax.geometry.lines import polar_through
-from sofjax.likelihood.measurements import Measurements, SensorModel
+from sofjax.likelihood.measurements import Measurements
+from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.segment_map import (
     MapConfig,
     SegmentMap,
@@ -54,7 +55,7 @@ def measurements_of(*ends, sigma=0.01):
         valid=jnp.arange(M) < len(ends),
         line=jax.vmap(polar_through)(padded),
         covariance=jnp.broadcast_to(sigma**2 * jnp.eye(2), (M, 2, 2)),
-        tilt=jnp.zeros((M, 2, 2)),
+        by_jitter=jnp.zeros((M, 2, 2)),
     )
 
 
@@ -553,7 +554,7 @@ def test_two_pieces_of_one_line_inform_as_two_measurements_would():
 def test_a_jitter_is_taken_out_of_what_is_integrated():
     measurements = dataclasses.replace(
         measurements_of(across(1.03)),
-        tilt=jnp.broadcast_to(jnp.array([[3.0, 0.0], [0.0, 0.0]]), (M, 2, 2)),
+        by_jitter=jnp.broadcast_to(jnp.array([[3.0, 0.0], [0.0, 0.0]]), (M, 2, 2)),
     )
     m = seen(empty_map(GAMMA), across(1.0))
     known = jnp.arange(M) < 1
@@ -592,7 +593,7 @@ def test_the_candidates_are_the_nearest_lines_of_a_loop_over_all_pairs(propagate
         m = random_map(rng)
         measurements = dataclasses.replace(
             measurements_of(*(rng.normal(size=(M, 2, 2)))),
-            tilt=jnp.asarray(rng.normal(size=(M, 2, 2))),
+            by_jitter=jnp.asarray(rng.normal(size=(M, 2, 2))),
         )
         at = pose(*rng.normal(size=3) * 0.3)
         candidates, slot, nearest = proposals(rules, sensor, m, measurements, at)
@@ -606,7 +607,7 @@ def test_the_candidates_are_the_nearest_lines_of_a_loop_over_all_pairs(propagate
                 opposite = np.cos(measurements.line.theta[i] - seen_line[1]) < 0
                 by_its_name = np.diag([-1, 1]) if opposite else np.eye(2)
                 S = S + (by_its_name @ np.asarray(H @ P @ H.T) @ by_its_name if propagate else 0)
-                J = np.asarray(measurements.tilt[i])
+                J = np.asarray(measurements.by_jitter[i])
                 S_tilt = S + 0.05**2 * J @ J.T
                 extent = float(seen_line[2]) * at.inverse().apply(m.segments_world.endpoints[k])
                 if m.valid[k] and reference.overlap(extent, measurements.endpoints_nadir[i]) > -0.3:
@@ -622,7 +623,7 @@ def test_the_candidates_are_the_nearest_lines_of_a_loop_over_all_pairs(propagate
                 S, S_tilt, seen_line = kept[k]
                 np.testing.assert_allclose(candidates.precision[i, j], np.linalg.inv(S), rtol=1e-6)
                 np.testing.assert_allclose(
-                    candidates.precision_tilt[i, j], np.linalg.inv(S_tilt), rtol=1e-6
+                    candidates.precision_with_jitter[i, j], np.linalg.inv(S_tilt), rtol=1e-6
                 )
                 found = (
                     candidates.line.rho[i, j],

@@ -98,7 +98,7 @@ def test_noise_multiplies_the_variance_of_the_pixels(camera, mount):
         see(SensorModel(), camera, mount, segments(SEGMENTS), DEPTH, noise) for noise in (1.0, 3.0)
     )
     np.testing.assert_allclose(thrice.covariance, 3 * once.covariance)
-    np.testing.assert_array_equal(thrice.tilt, once.tilt)
+    np.testing.assert_array_equal(thrice.by_jitter, once.by_jitter)
 
 
 def test_a_known_jitter_is_corrected(camera, rolled):
@@ -109,7 +109,7 @@ def test_a_known_jitter_is_corrected(camera, rolled):
     )
     found = see(SensorModel(), camera, rolled, segments(SEGMENTS), DEPTH)
     true = floor_lines(camera, tipped, SEGMENTS)
-    corrected = found.under_tilt(jnp.asarray(jitter))
+    corrected = found.without_jitter(jnp.asarray(jitter))
     before = np.stack([found.line.rho, found.line.theta], 1) - true
     after = np.stack([corrected.rho, corrected.theta], 1) - true
     assert (np.linalg.norm(after, axis=1) < 0.05 * np.linalg.norm(before, axis=1)).all()
@@ -121,7 +121,7 @@ def test_the_paper_has_one_constant_sigma(camera, mount):
     np.testing.assert_allclose(
         found.covariance, np.broadcast_to(np.diag([0.05**2, 0.03**2]), (5, 2, 2))
     )
-    np.testing.assert_array_equal(found.tilt, 0)
+    np.testing.assert_array_equal(found.by_jitter, 0)
 
 
 def test_a_segment_whose_direction_is_hardly_known_is_no_measurement(camera, mount):

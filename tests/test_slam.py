@@ -15,10 +15,13 @@ from conftest import jit_quickly, make_camera
 
 from sofjax import slam
 from sofjax.extraction.observation import Observation
+from sofjax.extraction.sof import View
 from sofjax.geometry import SE2, Mount, Segments, projection_matrix
 from sofjax.motion import MotionModel
-from sofjax.particles import effective_size
+from sofjax.particles import effective_size, mean_pose
 from sofjax.segment_map import final_map
+from sofjax.slam import SofSlam
+from sofjax.slam.advance import LOST_AFTER
 from sofjax.slam.presets import DEFAULT, PAPER
 
 T, M, N, K = 40, 32, 64, 96
@@ -37,7 +40,7 @@ MOUNT = Mount.create(height=0.6, pitch=0.2618, x=0.05)
 CAMERA = make_camera()
 
 # one trace for all the images, keys and numbers of every test below
-step = jit_quickly(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
+step = jit_quickly(eqx.debug.assert_max_traces(SofSlam.step.__wrapped__, max_traces=1))
 
 
 def tiles():
@@ -83,13 +86,13 @@ def black(motion):
 
 
 def start(config=CONFIG, seed=0):
-    return slam.init(config, CAMERA, MOUNT, jax.random.key(seed), M)
+    return SofSlam(config, CAMERA, MOUNT).init(jax.random.key(seed), M)
 
 
 def stepped(observations, config=CONFIG, seed=0, state=None):
     state, infos = start(config, seed) if state is None else state, []
     for observation in observations:
-        state, info = step(config, CAMERA, MOUNT, state, observation)
+        state, info = step(SofSlam(config, CAMERA, MOUNT), state, observation)
         infos.append(info)
     return state, jax.tree.map(lambda *a: jnp.stack(a), *infos)
 
@@ -170,8 +173,8 @@ def test_a_wheel_that_spins_is_found_out():
     spun = eqx.tree_at(
         lambda o: o.motion.yaw, observations, observations.motion.yaw.at[T // 2].add(np.radians(3))
     )
-    state = slam.init(config, CAMERA, MOUNT, jax.random.key(0), M)
-    _, infos = slam.run(config, CAMERA, MOUNT, state, spun)
+    state = SofSlam(config, CAMERA, MOUNT).init(jax.random.key(0), M)
+    _, infos = SofSlam(config, CAMERA, MOUNT).run(state, spun)
     error = np.degrees(np.asarray(infos.T_world_robot.yaw) - true[:, 2])
     assert abs(error[T // 2 + 3 :]).max() < 0.6
     assert trajectory_error(infos.T_world_robot.xy) < 0.02
@@ -224,7 +227,7 @@ def test_edges_of_doors_are_never_born():
         motion = SE2(jnp.array([0.08, 0.01]), jnp.array(0.01, float)) if i else SE2.identity()
         segments = Segments(ends, jnp.arange(M) < len(doors))
         observation = Observation(segments, motion, jnp.zeros((), int))
-        state, info = step(CONFIG, CAMERA, MOUNT, state, observation)
+        state, info = step(SofSlam(CONFIG, CAMERA, MOUNT), state, observation)
         assert info.below_horizon >= 3
     assert not state.segment_map.valid.any()
 
@@ -237,12 +240,12 @@ def test_a_scan_is_one_step_after_the_other():
             jax.tree.map, lambda a: a.astype(float) if a.dtype == "float32" else a
         )
         camera, mount, observations = as_float64((CAMERA, MOUNT, drive()[1]))
-        one_step, scan = (jit_quickly(f.__wrapped__) for f in (slam.step, slam.run))
-        one = state = slam.init(CONFIG, camera, mount, jax.random.key(0), M)
-        scanned_state, scanned = scan(CONFIG, camera, mount, state, observations)
+        one_step, scan = (jit_quickly(f.__wrapped__) for f in (SofSlam.step, SofSlam.run))
+        one = state = SofSlam(CONFIG, camera, mount).init(jax.random.key(0), M)
+        scanned_state, scanned = scan(SofSlam(CONFIG, camera, mount), state, observations)
         for i in range(T):
             observation = jax.tree.map(operator.itemgetter(i), observations)
-            one, info = one_step(CONFIG, camera, mount, one, observation)
+            one, info = one_step(SofSlam(CONFIG, camera, mount), one, observation)
             for a, b in zip(numbers(scanned), numbers(info), strict=True):
                 np.testing.assert_allclose(a[i], b, rtol=1e-6, atol=1e-9)
         for a, b in zip(numbers(scanned_state), numbers(one), strict=True):
@@ -252,7 +255,7 @@ def test_a_scan_is_one_step_after_the_other():
 def test_the_state_keeps_its_types_from_the_first_step_on():
     """Or the second image would be compiled anew."""
     before = start()
-    after, _ = jax.eval_shape(slam.step, CONFIG, CAMERA, MOUNT, before, frame(0))
+    after, _ = jax.eval_shape(SofSlam(CONFIG, CAMERA, MOUNT).step, before, frame(0))
     for a, b in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         assert getattr(a, "weak_type", False) == b.weak_type
@@ -289,7 +292,7 @@ def test_an_image_is_compared_with_the_last_view_a_baseline_away(used):
     state, info = stepped(map(frame, range(12)))
 
     def view(i, segments):
-        return slam.View(segments, SE2(info.T_world_robot.xy[i], info.T_world_robot.yaw[i]))
+        return View(segments, SE2(info.T_world_robot.xy[i], info.T_world_robot.yaw[i]))
 
     nothing = black(SE2.identity()).segments_image
     views = {
@@ -328,7 +331,7 @@ def test_black_images_leave_the_map_as_it_is_and_follow_the_odometer():
     dark = [black(SE2(xy, yaw)) for xy, yaw in zip(motions.xy, motions.yaw, strict=True)]
     after, info = stepped(dark, config, state=state)
     assert_bitwise_equal(after.segment_map, state.segment_map)
-    begin = slam.mean_pose(state.particles)
+    begin = mean_pose(state.particles)
     here = reference.pose_matrix([*begin.xy, begin.yaw])
     expected = [reference.pose_of(here @ reference.pose_matrix(p)) for p in odometry(motions)]
     np.testing.assert_allclose(info.T_world_robot.xy, np.array(expected)[:, :2], atol=1e-5)
@@ -342,7 +345,7 @@ def test_black_images_with_a_noisy_odometer_are_followed_in_the_mean():
     assert_bitwise_equal(after.segment_map, state.segment_map)
     way = np.linalg.norm(np.asarray(info.T_world_robot.xy[-1] - info.T_world_robot.xy[0]))
     assert way == pytest.approx(1.1 * (1 + float(info.bias[0, 0])), abs=0.01)
-    np.testing.assert_array_equal(info.lost, np.arange(12) >= slam.LOST_AFTER - 1)
+    np.testing.assert_array_equal(info.lost, np.arange(12) >= LOST_AFTER - 1)
     spread = after.particles.T_world_robot.xy.std(axis=0)
     assert (spread > state.particles.T_world_robot.xy.std(axis=0)).all()
 
@@ -395,7 +398,7 @@ def test_no_input_makes_a_number_that_is_none(segments):
             segments, SE2(jnp.array([x, y], float), jnp.array(yaw, float)), jnp.zeros((), int)
         )
         for _ in range(2):
-            state, info = step(CONFIG, CAMERA, MOUNT, state, observation)
+            state, info = step(SofSlam(CONFIG, CAMERA, MOUNT), state, observation)
             assert_finite((state, info))
 
 
@@ -404,8 +407,12 @@ def test_a_sensor_that_stays_inconsistent_leaves_it_to_the_odometer():
     before = effective_size(state.particles.log_weight)
     size = {}
     for noise in (1.0, CONFIG.sensor.noise_max):
-        doubted = eqx.tree_at(lambda s: s.noise, state, jnp.asarray(noise, state.noise.dtype))
-        _, info = step(CONFIG, CAMERA, MOUNT, doubted, frame(20))
+        doubted = eqx.tree_at(
+            lambda s: s.variance_inflation,
+            state,
+            jnp.asarray(noise, state.variance_inflation.dtype),
+        )
+        _, info = step(SofSlam(CONFIG, CAMERA, MOUNT), doubted, frame(20))
         size[noise] = float(info.effective_size)
         assert info.matched > 0  # so that it can be trusted again
     assert size[1.0] < 0.7 * before < 0.95 * before < size[CONFIG.sensor.noise_max]
@@ -419,10 +426,10 @@ def test_the_weights_stay_normalised():
 
 def test_the_paper_s_settings_run_with_a_single_winner():
     config = with_sizes(PAPER)
-    paper = jit_quickly(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
+    paper = jit_quickly(eqx.debug.assert_max_traces(SofSlam.step.__wrapped__, max_traces=1))
     state, errors = start(config), []
     for i in range(T):
-        state, info = paper(config, CAMERA, MOUNT, state, frame(i))
+        state, info = paper(SofSlam(config, CAMERA, MOUNT), state, frame(i))
         assert_finite((state, info))
         # the next particles are all drawn from the one that was chosen
         np.testing.assert_array_equal(
@@ -490,7 +497,7 @@ def test_runs_side_by_side_are_the_runs_one_by_one():
         def run(pixel_sigma, height, key, log):
             config = eqx.tree_at(lambda c: c.sensor.pixel_sigma, CONFIG, pixel_sigma)
             at = eqx.tree_at(lambda m: m.height, mount, height)
-            return slam.run(config, camera, at, slam.init(config, camera, at, key, M), log)
+            return SofSlam(config, camera, at).run(SofSlam(config, camera, at).init(key, M), log)
 
         stacked = jax.tree.map(lambda *a: jnp.stack(a), *several)
         together, alone = jit_quickly(jax.vmap(run))(*stacked), jit_quickly(run)
@@ -520,12 +527,12 @@ def test_what_the_odometer_does_not_tell_spreads_the_particles():
     sigma = jnp.array([0.3, 0.1, 0.2])
     still = dataclasses.replace(black(SE2.identity()), motion_sigma=sigma)
     known = dataclasses.replace(still, motion_sigma=jnp.zeros(3))
-    step = jit_quickly(slam.step.__wrapped__)
-    spread, _ = step(CONFIG, CAMERA, MOUNT, state, still)
+    step = jit_quickly(SofSlam.step.__wrapped__)
+    spread, _ = step(SofSlam(CONFIG, CAMERA, MOUNT), state, still)
     twist = np.asarray(spread.particles.T_world_robot.log())
     np.testing.assert_allclose(twist.std(axis=0), sigma, rtol=0.35)
     assert (np.asarray(spread.particles.bias.mean) == 0).all()  # it is no error of the odometer
-    same, _ = step(CONFIG, CAMERA, MOUNT, state, known)
+    same, _ = step(SofSlam(CONFIG, CAMERA, MOUNT), state, known)
     assert (np.asarray(same.particles.T_world_robot.xy) == 0).all()
 
 

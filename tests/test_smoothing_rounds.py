@@ -12,7 +12,7 @@ from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, floor_to_image
 from sofjax.motion import MotionModel
 from sofjax.segment_map import MapConfig, empty_map
-from sofjax.slam.step import SlamConfig
+from sofjax.slam.config import SlamConfig
 from sofjax.smoothing import (
     Keyframes,
     Path,

@@ -13,10 +13,10 @@ import test_slam
 from conftest import jit_quickly
 from test_likelihood import as_arrays, random_problem
 
-from sofjax import slam
+from sofjax import SofSlam
 from sofjax.extraction.association import Association, gate_probability
-from sofjax.geometry import SE2
-from sofjax.likelihood.measurements import SensorModel
+from sofjax.geometry import SE2, Segments
+from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.likelihood.tracking import log_density
 from sofjax.motion import OdometerBias
 from sofjax.particles import Particles, systematic
@@ -42,8 +42,9 @@ def evidence(settings, mount, camera, observations):
     """Summed over a drive, with what the filter said and the state before the first image."""
     where = lambda c: [getattr(getattr(c, part), name) for part, name in VARIABLES]
     config = eqx.tree_at(where, CONFIG, list(settings))
-    start = slam.init(config, camera, mount, jax.random.key(0), test_slam.M)
-    _, info = slam.run(config, camera, mount, start, observations)
+    slam = SofSlam(config, camera, mount)
+    start = slam.init(jax.random.key(0), test_slam.M)
+    _, info = slam.run(start, observations)
     return info.log_evidence.sum(), info
 
 
@@ -97,7 +98,9 @@ def test_what_is_too_vague_to_be_used_counts_as_anywhere_in_the_image():
 def test_the_gradient_keeps_a_state_a_step_and_works_the_rest_out_again():
     program, *_ = differentiated()
     state = jax.eval_shape(
-        lambda: slam.init(CONFIG, test_slam.CAMERA, test_slam.MOUNT, jax.random.key(0), test_slam.M)
+        lambda: SofSlam(CONFIG, test_slam.CAMERA, test_slam.MOUNT).init(
+            jax.random.key(0), test_slam.M
+        )
     )
     state = sum(a.size for a in jax.tree.leaves(state)) * 8
     pairs = N * test_slam.M * CONFIG.segment_map.candidates * 8
@@ -110,7 +113,7 @@ def test_the_gradient_is_finite_where_nothing_is_seen():
     for blank in (0, 1):  # no segments at all; all of them one point
         ends = observations.segments_image.endpoints * 0 + 160.0 * blank
         valid = observations.segments_image.valid & bool(blank)
-        dark = dataclasses.replace(observations, segments_image=slam.Segments(ends, valid))
+        dark = dataclasses.replace(observations, segments_image=Segments(ends, valid))
         (value, _), gradient = program(at, dark)
         assert np.isfinite(value) and np.isfinite(gradient).all()
 

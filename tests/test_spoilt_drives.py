@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import jit_quickly
 
-from sofjax import slam
+from sofjax import SofSlam
 from sofjax.cli import main
 from sofjax.evaluation import evaluate_trajectory
 from sofjax.geometry import SE2
@@ -63,8 +63,8 @@ def write(file, rows):
 
 @jit_quickly
 def followed(camera, mount, log):
-    state = slam.init(DEFAULT, camera, mount, jax.random.key(0), CAPACITY)
-    return slam.run(DEFAULT, camera, mount, state, log)[1].T_world_robot
+    state = SofSlam(DEFAULT, camera, mount).init(jax.random.key(0), CAPACITY)
+    return SofSlam(DEFAULT, camera, mount).run(state, log)[1].T_world_robot
 
 
 def errors_of(drive, log, kept=slice(None)):

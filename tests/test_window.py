@@ -11,21 +11,14 @@ import reference
 from conftest import jit_quickly
 from test_slam import CAMERA, CONFIG, MOUNT, black, drive, start
 
-from sofjax import slam
 from sofjax.geometry import SE2, Segments
 from sofjax.likelihood.measurements import measure
 from sofjax.motion import MotionModel, OdometerBias
 from sofjax.segment_map import empty_map
-from sofjax.slam.fixed_lag import (
-    BIAS,
-    POSE,
-    FixedLagConfig,
-    Known,
-    _Linear,
-    _step,
-    empty_window,
-    slide,
-)
+from sofjax.slam import FixedLagConfig, SofSlam
+from sofjax.slam.bundle import BIAS, POSE, Linear, gauss_newton
+from sofjax.slam.fixed_lag import Image, Mapped, slide
+from sofjax.slam.keyframes import Known, empty_window
 
 J, M = 6, 16
 OPEN = dataclasses.replace(CONFIG, window=FixedLagConfig(keyframes=8, lines=32))
@@ -39,13 +32,15 @@ def test_a_step_is_that_of_the_dense_least_squares(rng):
         rng.integers(J, size=(W, M)), np.ones((W, M), bool), rng.normal(size=(W, M, 2)),
         rng.normal(size=(W, M, 2, POSE)), rng.normal(size=(W, M, 2, 3)), symmetric(W, M, 2, 2),
     )  # fmt: skip
-    linear = _Linear(*map(jnp.asarray, given), J)
+    linear = Linear(*map(jnp.asarray, given), J)
     known = Known(*map(jnp.asarray, (rng.normal(size=(J, 3)), symmetric(J, 3, 3))))
     line = jnp.asarray(rng.normal(size=(J, 3)))
     floor = np.array([0, 50.0] * (J // 2))
     R, r = rng.normal(size=(3 * n, n)), rng.normal(size=3 * n)
     held = np.arange(n) < POSE
-    x, after = _step(linear, known, floor, lambda x: R @ x + r, jnp.asarray(held), line)
+    x, after = gauss_newton(
+        linear, known, jnp.asarray(floor), lambda x: R @ x + r, jnp.asarray(held), line
+    )
 
     # every residual as rows over all poses, the odometer's errors, and all lines
     rows, right = [np.hstack([R, np.zeros((3 * n, 3 * J))])], [-r]
@@ -87,8 +82,10 @@ def seen_from(camera, mount, pose):
 @pytest.mark.usefixtures("x64")
 def test_an_estimate_that_is_off_comes_back_with_the_window(camera, mount):
     """Lines seen without noise, an odometer that reads three per cent too much."""
-    rules, map_config = FixedLagConfig(keyframes=5, lines=16), CONFIG.segment_map
     model = MotionModel(distance_scale_sigma=0.05)
+    window_config, map_config = FixedLagConfig(keyframes=5, lines=16), CONFIG.segment_map
+    config = dataclasses.replace(CONFIG, motion=model, window=window_config)
+    slam = SofSlam(config, camera, mount)
     bias = OdometerBias(jnp.zeros(4), jnp.diag(jnp.array([0.05, 0.05, 0.05, 0.005]) ** 2))
     go = jit_quickly(slide)
     nadir, drifted = mount.T_robot_nadir, None
@@ -100,14 +97,15 @@ def test_an_estimate_that_is_off_comes_back_with_the_window(camera, mount):
         if i == 0:
             m, window = (
                 map_of(measurements, nadir),
-                empty_window(rules, map_config.capacity, measurements),
+                empty_window(window_config, map_config.capacity, measurements),
             )
         new = jnp.where(measurements.valid, jnp.arange(M), map_config.capacity)
-        window, m, T = go(
-            rules, map_config, CONFIG.sensor, model, window, m, nadir, read if i else true,
-            estimate, jnp.zeros(2), bias, measurements,
-            new if i == 0 else jnp.full(M, map_config.capacity), 8.0,
+        new = new if i == 0 else jnp.full(M, map_config.capacity)
+        image = Image(
+            estimate, jnp.zeros(2), bias, Mapped(measurements, new), read if i else true,
+            jnp.zeros(3),
         )  # fmt: skip
+        window, m, T = go(slam, window, m, image)
         drifted = estimate
         estimate = T @ estimate
         np.testing.assert_allclose(estimate.xy, true.xy, atol=1e-3)
@@ -135,19 +133,21 @@ def map_of(measurements, T_world_nadir):
 
 
 def test_a_drive_is_compiled_once_and_stays_near_the_truth():
-    step = jit_quickly(eqx.debug.assert_max_traces(slam.step.__wrapped__, max_traces=1))
+    step = jit_quickly(eqx.debug.assert_max_traces(SofSlam.step.__wrapped__, max_traces=1))
     true, observations = drive()
     state, xy = start(OPEN), []
     for i in range(len(true)):
         one = jax.tree.map(lambda a, i=i: a[i], observations)
-        state, info = step(OPEN, CAMERA, MOUNT, state, one)
+        state, info = step(SofSlam(OPEN, CAMERA, MOUNT), state, one)
         xy.append(info.T_world_robot.xy)
     assert int(state.window.count) > 8
     off = np.hypot(*(np.array(xy) - true[:, :2]).T)
     assert np.isfinite(off).all() and off.max() < 0.03
 
     # nothing seen: the window waits, and the particles go on by the odometer
-    after, _ = step(OPEN, CAMERA, MOUNT, state, black(SE2(jnp.array([0.3, 0.0]), jnp.zeros(()))))
+    after, _ = step(
+        SofSlam(OPEN, CAMERA, MOUNT), state, black(SE2(jnp.array([0.3, 0.0]), jnp.zeros(())))
+    )
     assert int(after.window.count) == int(state.window.count)
     off = after.window.motion.xy - state.window.motion.xy
     np.testing.assert_allclose(off, [0.3, 0], atol=0.02)

@@ -19,7 +19,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import slam, smoothing
+from sofjax import smoothing
 from sofjax.evaluation import evaluate_trajectory
 from sofjax.simulation import around, furnish, random_rig
 
@@ -73,8 +73,8 @@ def main() -> None:
     told["driven_s"] = float(np.ptp(drive.truth.stamps))
 
     begun = time.perf_counter()
-    start = slam.init(config, camera, mount, jax.random.key(args.seed), common.M)
-    state, info = jax.block_until_ready(slam.run(config, camera, mount, start, log))
+    start = SofSlam(config, camera, mount).init(jax.random.key(args.seed), common.M)
+    state, info = jax.block_until_ready(SofSlam(config, camera, mount).run(start, log))
     log, info = jax.tree.map(lambda a: np.asarray(a)[: told["images"]], (log, info))
     segment_map = jax.device_get(state.segment_map)
     told["seconds"]["filter"] = time.perf_counter() - begun

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import loop_closure, slam, smoothing
+from sofjax import loop_closure, smoothing
 from sofjax.evaluation import evaluate_trajectory
 from sofjax.geometry import SE2
 from sofjax.io.trajectory import Trajectory
@@ -58,8 +58,8 @@ def drive_one(kind: str, seed: int, size: float) -> dict[str, object]:
     drive = common.take_drive(world, random_rig(seed), seed)
     camera, mount, log = common.one_of(common.stack([drive]), 0)
     T, config = len(drive.truth.stamps), common.config_of()
-    start = slam.init(config, camera, mount, jax.random.key(seed), common.M)
-    state, info = slam.run(config, camera, mount, start, log)
+    start = SofSlam(config, camera, mount).init(jax.random.key(seed), common.M)
+    state, info = SofSlam(config, camera, mount).run(start, log)
     log, info = jax.tree.map(lambda leaf: np.asarray(leaf)[:T], (log, info))
     begun = time.perf_counter()
     path = smoothing.Path(info.T_world_robot, info.tilt, info.bias[-1])

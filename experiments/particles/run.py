@@ -30,7 +30,7 @@ def run_size(N: int, drives: dict[str, common.Drive]) -> dict[str, object]:
     errors, cpu, wall, images = {}, 0.0, 0.0, 0
     for name, drive in drives.items():
         camera, mount, log = common.one_of(common.stack([drive]), 0)
-        start = slam.init(config, camera, mount, jax.random.key(7), common.M)
+        start = SofSlam(config, camera, mount).init(jax.random.key(7), common.M)
         call = lambda s=start, a=(camera, mount), log=log: jax.block_until_ready(
             slam.run(config, *a, s, log)
         )

@@ -21,7 +21,6 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import slam
 from sofjax.extraction.observation import Observation
 
 TOGETHER = 16  # runs side by side on a core: what they work on then fits into its cache
@@ -49,8 +48,8 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
     keys = jax.random.split(jax.random.key(seed), runs)
 
     def run(log, key):
-        state = slam.init(config, drive.camera, drive.mount, key, M)
-        return slam.run(config, drive.camera, drive.mount, state, log)[1]
+        state = SofSlam(config, drive.camera, drive.mount).init(key, M)
+        return SofSlam(config, drive.camera, drive.mount).run(state, log)[1]
 
     def share(log, keys):
         return jax.lax.map(lambda key: run(log, key), keys, batch_size=TOGETHER)

@@ -36,7 +36,6 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
     import jax
     import jax.numpy as jnp
 
-    from sofjax import slam
     from sofjax.geometry import Segments
 
     drive = common.random_drive("random", seed, images)
@@ -47,9 +46,9 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
     observations = type(observations)(repeated, observations.motion, observations.overflow)
     config = common.config_of(filter={"particles": particles}, segment_map={"capacity": map})
     camera, mount = drive.camera, drive.mount
-    state = slam.init(config, camera, mount, jax.random.key(seed), segments)
+    state = SofSlam(config, camera, mount).init(jax.random.key(seed), segments)
     begun = time.process_time()
-    compiled = slam.run.lower(config, camera, mount, state, observations).compile()
+    compiled = SofSlam.run.lower(config, camera, mount, state, observations).compile()
     compiling = time.process_time() - begun
     call = lambda: jax.block_until_ready(compiled(config, camera, mount, state, observations))
     call()

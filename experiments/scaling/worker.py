@@ -36,16 +36,16 @@ def main() -> None:
     drive = common.random_drive("random", args.seed, args.images)
     camera, mount, log = drive.camera, drive.mount, drive.observations
     config = common.config_of(filter={"particles": 1024}, segment_map={"capacity": 128})
-    state = slam.init(config, camera, mount, jax.random.key(args.seed), common.M)
+    state = SofSlam(config, camera, mount).init(jax.random.key(args.seed), common.M)
 
     auto = (jax.sharding.AxisType.Auto,)
     mesh = jax.make_mesh((jax.device_count(),), ("particles",), axis_types=auto)
     copied = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-    state = slam.distribute(state, mesh)
+    state = slam.shard(state, mesh)
     camera, mount, log = jax.jit(lambda a: a, out_shardings=copied)((camera, mount, log))
-    jax.block_until_ready(slam.run(config, camera, mount, state, log))  # compiled
+    jax.block_until_ready(SofSlam(config, camera, mount).run(state, log))  # compiled
     begun = time.perf_counter()
-    state, info = jax.block_until_ready(slam.run(config, camera, mount, state, log))
+    state, info = jax.block_until_ready(SofSlam(config, camera, mount).run(state, log))
     seconds = time.perf_counter() - begun
     if args.rank == 0:
         held = [shard.data.shape[0] for shard in state.particles.log_weight.addressable_shards]

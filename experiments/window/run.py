@@ -18,8 +18,6 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import slam
-
 SIZES = (0, 8, 12)  # keyframes; 0: none are smoothed
 
 
@@ -31,13 +29,13 @@ def run_drive(seed: int, sizes: tuple[int, ...], images: int | None) -> dict[str
     log = jax.tree.map(room, drive.observations)  # few lengths to compile for
     for size in sizes:
         config = common.config_of(window={"keyframes": size})
-        state = slam.init(config, drive.camera, drive.mount, jax.random.key(seed), common.M)
+        state = SofSlam(config, drive.camera, drive.mount).init(jax.random.key(seed), common.M)
         call = lambda c=config, s=state: jax.block_until_ready(
-            slam.run(c, drive.camera, drive.mount, s, log)
+            SofSlam(c, drive.camera, drive.mount).run(s, log)
         )
-        begun, before = time.process_time(), slam.run._cache_size()
+        begun, before = time.process_time(), SofSlam.run._cache_size()
         _, info = call()
-        if slam.run._cache_size() > before:  # it was compiled
+        if SofSlam.run._cache_size() > before:  # it was compiled
             begun = time.process_time()
             _, info = call()
         ms = 1e3 * (time.process_time() - begun) / len(log.motion.yaw)

@@ -6,10 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from sofjax import slam
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.camera import Camera, Mount
-from sofjax.slam.step import SlamConfig
+from sofjax.slam import SlamConfig, SofSlam
 from sofjax.smoothing import Path, Smoothed, SmoothingConfig, smooth
 
 WIDE = {"height": 0.3, "pitch": 0.1, "roll": 0.1, "yaw": 0.1}  # priors: heights, radians
@@ -42,11 +41,10 @@ def fit_jointly(
     with jax.enable_x64(False):
         single = lambda tree: jax.tree.map(_single, tree)
         camera_, mount_, log_ = single(camera), single(mount), single(log)
-        state = slam.init(
-            config, camera_, mount_, jax.random.key(0), log_.segments_image.valid.shape[1]
-        )
-        state, info = slam.run(config, camera_, mount_, state, log_)
-        path = Path(info.T_world_robot, info.tilt, info.bias[-1].at[0].set(0.0))
+        slam = SofSlam(config, camera_, mount_)
+        state = slam.init(jax.random.key(0), log_.segments_image.valid.shape[1])
+        state, info = slam.run(state, log_)
+        path = Path(info.T_world_robot, info.jitter, info.bias[-1].at[0].set(0.0))
     return smooth(config, camera, mount, log, path, state.segment_map, rules)
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sofjax.extraction.observation import Observation
     from sofjax.io.drive import Drive
     from sofjax.pipeline.settings import RunSettings
-    from sofjax.slam.step import SlamState, StepInfo
+    from sofjax.slam.state import SlamState, StepInfo
     from sofjax.vision import Frontend, View
 
 LOOPS = ("none", "paper", "smooth")
@@ -199,17 +199,16 @@ def steps(
     """Fig. 6 for one image after the other, with the seconds that each waited and computed."""
     import jax
 
-    from sofjax import slam
+    from sofjax.slam import SofSlam
     from sofjax.vision import observations
 
-    config, camera, mount = settings.slam, drive.camera_file.camera, drive.camera_file.mount
-    key = jax.random.key(settings.seed)
-    state = slam.init(config, camera, mount, key, settings.frontend.capacity)
+    slam = SofSlam(settings.slam, drive.camera_file.camera, drive.camera_file.mount)
+    state = slam.init(jax.random.key(settings.seed), settings.frontend.capacity)
     with closing(views(frontend, drive.image_files)) as coming:
         begun = time.perf_counter()
         for view, observed in observations(drive, coming):
             waited = time.perf_counter()
-            state, info = slam.step(config, camera, mount, state, observed)
+            state, info = slam.step(state, observed)
             info = jax.device_get(info)
             stepped = time.perf_counter()
             yield view, observed, info, {"wait": waited - begun, "step": stepped - waited}, state

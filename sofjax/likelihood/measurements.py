@@ -1,4 +1,4 @@
-"""Sensor model, and the segments of an image as it sees them on the floor; II.B, III.A.
+"""An image's segments as measurements of lines on the floor; II.B, III.A.
 
 Everything here happens in the frame of the camera's nadir, the floor point under the optical
 centre with the axes of the robot: there the apparent line of anything parallel to the floor keeps
@@ -17,22 +17,7 @@ from sofjax.geometry.lines import PolarLine, polar_through
 from sofjax.geometry.matrices import determinant_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
-
-
-class SensorModel(eqx.Module):
-    """Gaussian noise of a segment in (rho, theta), and the cost of one that fits nothing."""
-
-    propagate: bool = eqx.field(static=True, default=True)  # or the paper's constant sigmas
-    pixel_sigma: float = 0.5  # pixels, of an end point across its segment
-    tilt_sigma: float = 0.001  # radians, jitter of pitch and of roll from image to image
-    rho_sigma: float = 0.02  # metres; the constant sigmas, and with `propagate` ...
-    theta_sigma: float = 0.02  # radians; ... unused
-    upright: float = 1.0  # pixels that an upright's ends may be off a line to the nadir; 0: none
-    theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
-    adaptation: float = 0.3  # share of the surplus misfit by which the noise grows in a step
-    noise_gate: float = 4.0  # multiple of the variance up to which it widens what may match; ...
-    noise_max: float = 1e4  # ... up to here it only lessens the weight of the measurements
-    e_max: float = 9.0  # cost of an observed segment that matches nothing
+from sofjax.likelihood.sensor_model import SensorModel
 
 
 class Measurements(eqx.Module):
@@ -42,13 +27,13 @@ class Measurements(eqx.Module):
     valid: Bool[Array, "*batch"]
     line: PolarLine  # about the nadir
     covariance: Float[Array, "*batch 2 2"]  # of (rho, theta), from noise of the end points alone
-    tilt: Float[Array, "*batch 2 2"]  # d(rho, theta) / d(pitch, roll) of the camera's jitter
+    by_jitter: Float[Array, "*batch 2 2"]  # d(rho, theta) / d(pitch, roll) of the camera's jitter
     log_area: Float[Array, "*batch"] | float = 0.0  # log of (metres · radians) that a pixel² makes
     upright: Bool[Array, "*batch"] | bool = False  # it may be: no line of the map begins with it
 
-    def under_tilt(self, tilt: Float[Array, "2"]) -> PolarLine:
-        """The lines, corrected for a jitter (pitch, roll) of the mount."""
-        shift = self.tilt @ tilt
+    def without_jitter(self, jitter: Float[Array, "2"]) -> PolarLine:
+        """The lines, corrected for the attitude jitter (pitch, roll) of the image."""
+        shift = self.by_jitter @ jitter
         return PolarLine(self.line.rho - shift[..., 0], self.line.theta - shift[..., 1])
 
 
@@ -73,51 +58,51 @@ def measure(
     """
     nadir = mount.T_robot_nadir.xy
 
-    def on_floor(endpoints_image, tilt):
+    def on_floor(endpoints_image: Array, jitter: Array) -> tuple[Array, tuple]:
         jittered = eqx.tree_at(
-            lambda m: (m.pitch, m.roll), mount, (mount.pitch + tilt[0], mount.roll + tilt[1])
+            lambda m: (m.pitch, m.roll), mount, (mount.pitch + jitter[0], mount.roll + jitter[1])
         )
         H_F = floor_homography(camera, jittered, SE2.identity())
         endpoints, some = segment_to_floor(H_F, endpoints_image, jnp.asarray(max_depth))
         line = polar_through(endpoints - nadir)
         return jnp.stack([line.rho, line.theta]), (endpoints - nadir, line, some)
 
-    def one(endpoints_image):
-        (by_pixel, by_tilt), (endpoints, line, some) = jax.jacfwd(
+    def one(endpoints_image: Array) -> tuple:
+        (by_pixel, by_jitter), (endpoints, line, some) = jax.jacfwd(
             on_floor, argnums=(0, 1), has_aux=True
         )(endpoints_image, jnp.zeros(2))
         by_pixel = by_pixel.reshape(2, 4)
         propagated = noise * sensor.pixel_sigma**2 * by_pixel @ by_pixel.T
         area2 = determinant_2x2(by_pixel @ by_pixel.T)
         log_area = 0.5 * jnp.log(jnp.where(area2 > 0, area2, 1))
-        return endpoints, line, some, propagated, by_tilt, log_area
+        return endpoints, line, some, propagated, by_jitter, log_area
 
-    endpoints, line, some, covariance, tilt, log_area = jax.vmap(one)(segments_image.endpoints)
+    endpoints, line, some, covariance, by_jitter, log_area = jax.vmap(one)(segments_image.endpoints)
     if not sensor.propagate:
         constant = jnp.array([sensor.rho_sigma, sensor.theta_sigma]) ** 2
         covariance = jnp.broadcast_to(jnp.diag(constant), covariance.shape)
-        tilt = jnp.zeros_like(tilt)
+        by_jitter = jnp.zeros_like(by_jitter)
     has_length = (segments_image.endpoints[:, 0] != segments_image.endpoints[:, 1]).any(axis=-1)
     some = some & has_length & (covariance[:, 1, 1] < sensor.theta_limit**2)
     nadir_image = floor_homography(camera, mount, SE2.identity()) @ jnp.append(nadir, 1)
     upright = jax.vmap(may_be_upright, in_axes=(None, 0, None))(
         nadir_image, segments_image.endpoints, sensor.upright
     )
-    # what is reported at the nominal tilt moves against the correction
+    # what is reported at the nominal attitude moves against the correction
     some = some & segments_image.valid
-    return Measurements(endpoints, some, line, covariance, -tilt, log_area, upright)
+    return Measurements(endpoints, some, line, covariance, -by_jitter, log_area, upright)
 
 
-PARALLEL = 0.05  # radians up to which directions are one: lines of the map are off by some of that
+PARALLEL = 0.05  # radians up to which directions count as one: the map's lines err so much
 
 
 def unobservable_direction(
     measurements: Measurements, known: Bool[Array, "M"]
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """The direction along which the known lines run, if they all do: no pose along it is told from
-    another.
+    """The direction along which all known lines run: the pose along it is not observable.
 
-    **Returns:** radians about the nadir, and whether all run along it as far as can be seen.
+    **Returns:** radians about the nadir, and whether there is such a direction: all known lines
+    are parallel within their sigmas.
     """
     theta, variance = (
         jnp.where(known, a, 0) for a in (measurements.line.theta, measurements.covariance[:, 1, 1])

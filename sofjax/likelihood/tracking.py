@@ -1,4 +1,11 @@
-"""How well a hypothetical pose explains the measurements of an image; III.A."""
+"""The sensor model as a step of the filter evaluates it: poses near the predicted one; III.A.
+
+Each measurement has a few candidate lines, precomputed as they appear from the predicted nadir. A
+pose then costs a dozen operations a candidate, and the image's attitude jitter is solved for.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,44 +15,47 @@ from jaxtyping import Array, Bool, Float, Int
 from sofjax.geometry.lines import PolarLine, alignment, normal, polar_differences
 from sofjax.geometry.matrices import determinant_2x2
 from sofjax.geometry.se2 import SE2
-from sofjax.likelihood.measurements import Measurements, SensorModel
+from sofjax.likelihood.measurements import Measurements
+from sofjax.likelihood.sensor_model import SensorModel, squared_error
 
 
-def adapt_noise(
-    sensor: SensorModel, noise: Float[Array, ""], misfit: Float[Array, ""]
+def adapt_inflation(
+    sensor: SensorModel, inflation: Float[Array, ""], misfit: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Believe the pixels less where matched segments disagree more than their sigmas allow.
+    """The variance inflation after an image: it grows where matched segments disagree too much.
 
-    A mount that is only roughly known, a rolling shutter or blur make all of them inconsistent,
-    and a filter that is too sure of its sensor then leaves the odometer. Matched errors e have
-    the mean 2; the noise never falls below the sensor model's, nor grows so far that the sensor
-    could not be trusted again.
+    A mount that is only roughly known, a rolling shutter or blur make all segments inconsistent,
+    and a filter that is too sure of its sensor then leaves the odometer. The inflation is at
+    least 1 and at most `sensor.noise_max`, from where the sensor can be trusted again.
+
+    **Arguments:**
+    - `misfit`: mean of e over the matched segments; 2 if the sigmas are true.
     """
-    grown = noise * jnp.exp(sensor.adaptation * (misfit / 2 - 1))
+    grown = inflation * jnp.exp(sensor.adaptation * (misfit / 2 - 1))
     return jnp.clip(grown, 1, sensor.noise_max)
 
 
 def pixels_and_weight(
-    sensor: SensorModel, noise: Float[Array, ""]
+    sensor: SensorModel, inflation: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """What the noise makes of the pixels' variance, as a multiple, and of the likelihood's weight.
+    """A multiple for the pixels' variance, and a weight for the log-likelihood.
 
-    What pixels do not explain is systematic, as the tilt of a mount that is degrees off: it does
-    not average out over segments and images, and wider gates would only take neighbours for one
-    another. So beyond `noise_gate` the logarithm of the likelihood counts less instead, until the
-    odometer alone decides. The soft form takes the variance only: a density has no weight.
+    What pixels do not explain is systematic, such as a mount that is degrees off: it does not
+    average out over segments and images, and wider gates would confuse neighbouring lines. So
+    beyond `noise_gate` the log-likelihood counts less instead, until the odometer alone decides.
+    The soft form takes the variance only: a density has no weight.
     """
-    variance = jnp.minimum(noise, sensor.noise_gate)
-    return variance, variance / noise
+    variance = jnp.minimum(inflation, sensor.noise_gate)
+    return variance, variance / inflation
 
 
 class Candidates(eqx.Module):
-    """C map lines for each of M measurements, as they should appear from the predicted nadir."""
+    """C map lines for each of M measurements, as predicted from the predicted nadir."""
 
     line: PolarLine  # [M, C]
-    apparent_scale: Float[Array, "M C"]  # magnification; 1 for what lies on the floor
-    precision: Float[Array, "M C 2 2"]  # inverse covariance of the difference, tilt apart
-    precision_tilt: Float[Array, "M C 2 2"]  # the same with the jitter of the tilt in it
+    apparent_scale: Float[Array, "M C"]  # h / (h - z): 1 on the floor
+    precision: Float[Array, "M C 2 2"]  # S⁻¹ of the difference, without jitter
+    precision_with_jitter: Float[Array, "M C 2 2"]  # the same with the attitude jitter in S
     valid: Bool[Array, "M C"]
 
 
@@ -53,64 +63,66 @@ def mahalanobis(
     difference: Float[Array, "*batch 2"], precision: Float[Array, "*#batch 2 2"]
 ) -> Float[Array, "*batch"]:
     """e = dᵀ W d."""
-    return _quadratic(_symmetric(precision), difference[..., 0], difference[..., 1])
+    return squared_error(_symmetric(precision), difference[..., 0], difference[..., 1])
 
 
-class Pairs(eqx.Module):
-    """Each measurement with each of its candidates, as far as no pose is needed to compare them.
+class Precomputed(eqx.Module):
+    """All that a score of measurements and candidates needs and that depends on no pose.
 
-    Numbers of what is padding are zero. Worked out once, whatever is compared with it.
+    Padding is zero.
     """
 
     valid: Bool[Array, "M"]  # measurements
-    there: Bool[Array, "M C"]
+    paired: Bool[Array, "M C"]  # valid measurement, valid candidate
     difference: tuple[Float[Array, "M C"], ...]  # of `_differences`
-    precision: tuple[Float[Array, "M C"], ...]  # W by its elements, tilt apart
-    precision_tilt: tuple[Float[Array, "M C"], ...]
-    tilt: Float[Array, "M 2 2"]  # J = d(rho, theta) / d(pitch, roll)
+    precision: tuple[Float[Array, "M C"], ...]  # W = S⁻¹ by its elements, without jitter
+    precision_with_jitter: tuple[Float[Array, "M C"], ...]
+    by_jitter: Float[Array, "M 2 2"]  # J = d(rho, theta) / d(pitch, roll)
     normal_equations: Float[Array, "M C 11"]  # Jᵀ W J, and Jᵀ W d as a function of the pose
 
 
-def pair(measurements: Measurements, candidates: Candidates) -> Pairs:
-    """Measurements and their candidates, made ready for `compare`."""
-    there = measurements.valid[:, None] & candidates.valid
+def precompute(measurements: Measurements, candidates: Candidates) -> Precomputed:
+    """Measurements and their candidates, precomputed for `score`."""
+    paired = measurements.valid[:, None] & candidates.valid
     difference, loose, W = jax.tree.map(
-        lambda a: jnp.where(there, a, 0),
-        (_differences(measurements, candidates), _symmetric(candidates.precision_tilt),
+        lambda a: jnp.where(paired, a, 0),
+        (_differences(measurements, candidates), _symmetric(candidates.precision_with_jitter),
          _symmetric(candidates.precision)),
     )  # fmt: skip
-    J = jnp.where(measurements.valid[:, None, None], measurements.tilt, 0)
-    by_tilt = [(J[:, 0, k, None], J[:, 1, k, None]) for k in range(2)]  # pitch, roll
-    JW = [(W[0] * rho + W[1] * theta, W[1] * rho + W[2] * theta) for rho, theta in by_tilt]
-    A = [JW[i][0] * by_tilt[j][0] + JW[i][1] * by_tilt[j][1] for i, j in ((0, 0), (0, 1), (1, 1))]
+    J = jnp.where(measurements.valid[:, None, None], measurements.by_jitter, 0)
+    by_axis = [(J[:, 0, k, None], J[:, 1, k, None]) for k in range(2)]  # pitch, roll
+    JW = [(W[0] * rho + W[1] * theta, W[1] * rho + W[2] * theta) for rho, theta in by_axis]
+    A = [JW[i][0] * by_axis[j][0] + JW[i][1] * by_axis[j][1] for i, j in ((0, 0), (0, 1), (1, 1))]
     d_rho, d_theta, by_x, by_y = difference
     b = [[r * d_rho + t * d_theta, r * by_x, r * by_y, t] for r, t in JW]
     sums = jnp.stack([*A, *b[0], *b[1]], axis=-1)
-    return Pairs(measurements.valid, there, difference, W, loose, J, sums)
+    return Precomputed(measurements.valid, paired, difference, W, loose, J, sums)
 
 
-class Comparison(eqx.Module):
+class Score(eqx.Module):
     """Poses against the map; particles are the last axis, over which the loops run."""
 
     log_likelihood: Float[Array, "*poses"]
     choice: Int[Array, "M *poses"]  # index among the candidates
-    error: Float[Array, "M *poses"]  # e of the chosen candidate, its share of the tilt removed
-    tilt: Float[Array, "2 *poses"]  # most likely jitter (pitch, roll) of the moment, radians
+    error: Float[Array, "M *poses"]  # e of the chosen candidate, its share of the jitter removed
+    jitter: Float[
+        Array, "2 *poses"
+    ]  # most likely attitude jitter (pitch, roll) of the image, radians
 
 
-def compare(
-    sensor: SensorModel, pairs: Pairs, T_predicted_nadir: SE2, used: Bool[Array, "M *#poses"]
-) -> Comparison:
+def score(
+    sensor: SensorModel, pairs: Precomputed, T_predicted_nadir: SE2, used: Bool[Array, "M *#poses"]
+) -> Score:
     """log L = -1/2 sum_m min(min_k e[m,k], e_max) of one pose or of many.
 
-    The jitter of the tilt moves all segments of one image together, which independent errors
+    The attitude jitter moves all segments of one image together, which independent errors
     cannot express: the associations are chosen with it as further noise, then its most likely
     value is solved for (two unknowns, prior `tilt_sigma`) and the errors are taken about it.
 
     Written out in numbers over [M, N] instead of in 2×2 matrices for one pose under `vmap`: XLA
     then makes loops of it that run over the particles, several times faster on a CPU. What the
-    normal equations of the tilt sum over the chosen candidates is linear in (1, x, y, yaw), and so
-    a product of matrices.
+    jitter's normal equations sum over the chosen candidates is linear in (1, x, y, yaw), and so a
+    product of matrices.
 
     **Arguments:**
     - `T_predicted_nadir`: hypothetical nadirs [*poses] in the predicted nadir's frame, in which the
@@ -119,29 +131,33 @@ def compare(
     - `used`: which measurements may match, of each particle's own SoF extraction. The others cost
       e_max too: a pose must not win by taking nothing for floor.
     """
-    poses, C = T_predicted_nadir.yaw.shape, pairs.there.shape[1]
+    poses, C = T_predicted_nadir.yaw.shape, pairs.paired.shape[1]
     x, y, yaw = T_predicted_nadir.xy[..., 0], T_predicted_nadir.xy[..., 1], T_predicted_nadir.yaw
     of_poses = lambda a: a.reshape(*a.shape, *[1] * len(poses))
 
-    def error(W, of, difference, rho=0.0, theta=0.0):
+    def error(
+        W: Sequence[Array], of: Callable, difference: tuple, rho: Any = 0.0, theta: Any = 0.0
+    ) -> Array:
         d_rho, d_theta, by_x, by_y = map(of, difference)
         moved = d_rho + (by_x * x + by_y * y), d_theta + yaw
-        return _quadratic([of(w) for w in W], moved[0] - rho, moved[1] - theta)
+        return squared_error([of(w) for w in W], moved[0] - rho, moved[1] - theta)
 
-    # a scan, as whoever asks for the choice would otherwise work all errors out anew
+    # a scan: it prevents XLA from recomputing all errors for each consumer of the choice
     width = 1 << C.bit_length()
 
-    def nearer(best, candidate):
-        c, there, loose, difference = candidate
+    def nearer(best: Array, candidate: tuple) -> tuple[Array, None]:
+        c, paired, loose, difference = candidate
         key = sortable(error(loose, of_poses, difference), c, width)
-        return jnp.where(of_poses(there) & (key < best), key, best), None
+        return jnp.where(of_poses(paired) & (key < best), key, best), None
 
     none = jnp.full((len(used), *poses), sortable(jnp.asarray(sensor.e_max), C, width))
-    each = jax.tree.map(lambda a: a.T, (pairs.there, pairs.precision_tilt, pairs.difference))
+    each = jax.tree.map(
+        lambda a: a.T, (pairs.paired, pairs.precision_with_jitter, pairs.difference)
+    )
     choice = jax.lax.scan(nearer, none, (jnp.arange(C), *each))[0] & (width - 1)
     choice = jnp.where(used, choice, C).astype(int)
 
-    def of_choice(a):
+    def of_choice(a: Array) -> Array:
         value = jnp.zeros(())
         for c in range(C):
             value = jnp.where(choice == c, of_poses(a[:, c]), value)
@@ -153,21 +169,23 @@ def compare(
         precision=jax.lax.Precision.HIGHEST,
     )  # fmt: skip
     gradient = [s[0] + s[1] * x + s[2] * y + s[3] * yaw for s in (sums[3:7], sums[7:])]
-    tilt, _, prior = _solve_tilt(sensor, sums[:3], gradient)
+    jitter, _, prior = _solve_jitter(sensor, sums[:3], gradient)
 
-    J = pairs.tilt
-    rho, theta = (of_poses(J[:, i, 0]) * tilt[0] + of_poses(J[:, i, 1]) * tilt[1] for i in range(2))
+    J = pairs.by_jitter
+    rho, theta = (
+        of_poses(J[:, i, 0]) * jitter[0] + of_poses(J[:, i, 1]) * jitter[1] for i in range(2)
+    )
     tight = error(pairs.precision, of_choice, pairs.difference, rho, theta)
     tight = jnp.where(choice < C, jnp.minimum(tight, sensor.e_max), sensor.e_max)
     total = jnp.sum(jnp.where(of_poses(pairs.valid), tight, 0), axis=0)
-    return Comparison(-0.5 * (total + prior), jnp.where(choice < C, choice, 0), tight, tilt)
+    return Score(-0.5 * (total + prior), jnp.where(choice < C, choice, 0), tight, jitter)
 
 
-def nothing_seen(sensor: SensorModel, pairs: Pairs) -> Comparison:
-    """What `compare` says of any one pose where no measurement is valid."""
+def nothing_seen(sensor: SensorModel, pairs: Precomputed) -> Score:
+    """What `score` says of any one pose where no measurement is valid."""
     M = pairs.valid.shape[0]
     unlike = jnp.full(M, jnp.asarray(sensor.e_max, float))
-    return Comparison(jnp.zeros(()), jnp.zeros(M, int), unlike, jnp.zeros(2))
+    return Score(jnp.zeros(()), jnp.zeros(M, int), unlike, jnp.zeros(2))
 
 
 def sortable(
@@ -192,47 +210,47 @@ def log_density(
     lines: Float[Array, ""],
     log_elsewhere: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """log p(segments | pose), the soft form of `compare`, with its constants; to differentiate.
+    """log p(segments | pose), the soft form of `score`, with its constants; to differentiate.
 
     Each measurement is one of the map's lines with the probability `known`, any of them alike, and
     anywhere in the image otherwise; the candidates stand for all lines, as the others are too far
     away to matter. The density is that of the end points across the line, per pixel², so that it
-    falls when a sigma is too large or too small and compares different mounts. The jitter of the
-    tilt is integrated out, about the value that the candidates, each by its share, make most
-    likely: exactly, if the shares are certain.
+    falls when a sigma is too large or too small and compares different mounts. The
+    attitude jitter is integrated out about its most likely value, given each candidate's share:
+    exactly, if the shares are certain.
 
     **Arguments:**
     - `known`: probabilities of the measurements, less than 1.
     - `lines`: how many of the map's lines are in view.
     - `log_elsewhere`: log density of a segment that is no line of the map, per pixel².
     """
-    there = measurements.valid[:, None] & candidates.valid
+    paired = measurements.valid[:, None] & candidates.valid
     d_rho, d_theta, by_x, by_y = _differences(measurements, candidates)
     x, y = T_predicted_nadir.xy
     moved = jnp.stack([d_rho + (by_x * x + by_y * y), d_theta + T_predicted_nadir.yaw], axis=-1)
-    difference = jnp.where(there[..., None], moved, 0)
+    difference = jnp.where(paired[..., None], moved, 0)
     log_area = jnp.where(measurements.valid, measurements.log_area, 0)[:, None]
     known = known[:, None]
-    weights = jnp.concatenate([jnp.where(there, known / lines, 0), 1 - known], axis=1)
+    weights = jnp.concatenate([jnp.where(paired, known / lines, 0), 1 - known], axis=1)
     elsewhere = jnp.broadcast_to(log_elsewhere, known.shape)
 
-    def log_mixture(d, W):
+    def log_mixture(d: Array, W: Array) -> tuple[Array, Array]:
         log_normal = 0.5 * (jnp.log(determinant_2x2(W)) - mahalanobis(d, W)) - jnp.log(2 * jnp.pi)
         each = jnp.concatenate([log_normal + log_area, elsewhere], axis=1)
         return each, jax.nn.logsumexp(each, axis=1, b=weights)
 
     W, W_tilt = (
-        jnp.where(there[..., None, None], a, jnp.eye(2))
-        for a in (candidates.precision, candidates.precision_tilt)
+        jnp.where(paired[..., None, None], a, jnp.eye(2))
+        for a in (candidates.precision, candidates.precision_with_jitter)
     )
     each, total = log_mixture(difference, W_tilt)
     share = weights * jnp.exp(jnp.where(weights > 0, each - total[:, None], -jnp.inf))
-    J = jnp.broadcast_to(measurements.tilt[:, None], W.shape)
+    J = jnp.broadcast_to(measurements.by_jitter[:, None], W.shape)
     JW = jnp.swapaxes(J, -1, -2) @ (share[:, :-1, None, None] * W)
     information = jnp.stack(_symmetric(jnp.sum(JW @ J, axis=(0, 1))))
     gradient = jnp.sum((JW @ difference[..., None])[..., 0], axis=(0, 1))
-    tilt, volume, prior = _solve_tilt(sensor, information, gradient)
-    _, total = log_mixture(difference - J @ tilt, W)
+    jitter, volume, prior = _solve_jitter(sensor, information, gradient)
+    _, total = log_mixture(difference - J @ jitter, W)
     return jnp.sum(jnp.where(measurements.valid, total, 0)) - 0.5 * (prior + jnp.log(volume))
 
 
@@ -255,18 +273,16 @@ def _symmetric(W: Float[Array, "*batch 2 2"]) -> tuple[Array, Array, Array]:
     return W[..., 0, 0], W[..., 0, 1], W[..., 1, 1]
 
 
-def _quadratic(W, d_rho, d_theta):
-    """e = dᵀ W d by W's elements: for a diagonal W the definition, (d_rho/sigma_rho)² + ..."""
-    return W[0] * d_rho**2 + 2 * W[1] * d_rho * d_theta + W[2] * d_theta**2
-
-
-def _solve_tilt(sensor, information, gradient):
-    """The most likely jitter of errors d = J tilt + noise: A = Jᵀ W J and b = Jᵀ W d given.
+def _solve_jitter(
+    sensor: SensorModel, information: Sequence[Array] | Array, gradient: Sequence[Array] | Array
+) -> tuple[Array, Array, Array]:
+    """The most likely jitter of errors d = J jitter + noise: A = Jᵀ W J and b = Jᵀ W d given.
 
     **Arguments:**
     - `information`: A by its elements (pitch, pitch), (pitch, roll), (roll, roll).
 
-    **Returns:** tilt; det(I + variance A), by which it narrows its prior; bᵀ tilt - tiltᵀ A tilt.
+    **Returns:** jitter; det(I + variance A), by which its prior narrows; bᵀ jitter -
+    jitterᵀ A jitter.
     """
     variance = sensor.tilt_sigma**2  # (I + variance A)^-1 variance b: right for variance = 0 too
     a, b, c = (
@@ -277,5 +293,5 @@ def _solve_tilt(sensor, information, gradient):
     volume = a * c - b * b
     pitch = variance * (c * gradient[0] - b * gradient[1]) / volume
     roll = variance * (a * gradient[1] - b * gradient[0]) / volume
-    prior = gradient[0] * pitch + gradient[1] * roll - _quadratic(information, pitch, roll)
+    prior = gradient[0] * pitch + gradient[1] * roll - squared_error(information, pitch, roll)
     return jnp.stack([pitch, roll]), volume, prior

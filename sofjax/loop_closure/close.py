@@ -10,7 +10,7 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.loop_closure.place_recognition import ClosingConfig
 from sofjax.loop_closure.revisits import Revisit, closed, joined_map, revisits, solved
 from sofjax.segment_map import FinalMap, SegmentMap
-from sofjax.slam.step import SlamConfig
+from sofjax.slam.config import SlamConfig
 from sofjax.smoothing import Path, Smoothed, SmoothingConfig, final_map, smooth
 
 DEFAULT, CLOSING = SmoothingConfig(), ClosingConfig()

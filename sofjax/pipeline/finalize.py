@@ -17,7 +17,7 @@ from sofjax.io.trajectory import Trajectory
 from sofjax.pipeline.run_log import Closed, RunLog
 from sofjax.pipeline.settings import RunSettings
 from sofjax.segment_map import FinalMap
-from sofjax.slam.step import SlamState
+from sofjax.slam.state import SlamState
 
 # where a user says that the drive ends as a loop: the share of lines that must fit, and the lead
 TOLD = loop_closure.ClosingConfig(share=0.4, margin=6.0)

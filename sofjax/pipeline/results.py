@@ -213,8 +213,8 @@ def warnings(drive: Drive, run_log: RunLog) -> list[str]:
         )
     if run_log.step["map_truncated"]:
         found.append(
-            f"more lines lay within sight than are compared, {run_log.step['map_hidden']} too many "
-            f"in {n} images; segment_map.nearby makes room"
+            f"more lines lay within sight than are compared, {run_log.step['map_truncated']} too "
+            f"many in {n} images; segment_map.nearby makes room"
         )
     if run_log.unheld > UNHELD:
         found.append(

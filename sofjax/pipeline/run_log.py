@@ -14,7 +14,7 @@ from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory
 from sofjax.motion import BIAS
 from sofjax.segment_map import FinalMap
-from sofjax.slam.step import StepInfo
+from sofjax.slam.state import StepInfo
 from sofjax.vision import View
 
 WARM = 10  # images that timing leaves out: the first one compiles
@@ -69,7 +69,7 @@ class RunLog:
         self.stamps.append(float(drive.image_stamps[i]))
         self.poses.append(pose)
         self.observations.append(jax.device_get(observed))
-        self.tilt.append(info.tilt)
+        self.tilt.append(info.jitter)
         self.across.append(int(info.across))
         self.bias = info.bias
         if view.fault:

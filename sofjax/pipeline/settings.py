@@ -8,7 +8,7 @@ from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.io.settings import INLINE, read_toml, to_dict, with_settings
 from sofjax.segment_map import MapConfig
 from sofjax.slam import presets
-from sofjax.slam.step import SlamConfig
+from sofjax.slam.config import SlamConfig
 from sofjax.vision import DETECTORS, FrontendSettings
 
 FRONTENDS = {"paper": FrontendSettings(detector="hough")}  # of a preset; the default otherwise

@@ -14,7 +14,7 @@ from sofjax.io.camera_file import doubts as camera_doubts
 from sofjax.io.drive import Drive, motions, odometry_warnings
 from sofjax.io.trajectory import Trajectory, gaps
 from sofjax.motion import BIAS, MotionModel, prior_bias
-from sofjax.slam.step import SlamConfig
+from sofjax.slam.config import SlamConfig
 
 FEW = 1 / 3  # of the segments on the floor's side, below which something is wrong ...
 ENOUGH = 100  # ... if there are so many

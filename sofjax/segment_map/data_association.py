@@ -11,7 +11,8 @@ from sofjax.geometry.lines import PolarLine, alignment, polar_differences, renam
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
-from sofjax.likelihood.measurements import Measurements, SensorModel
+from sofjax.likelihood.measurements import Measurements
+from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.likelihood.tracking import Candidates, sortable
 from sofjax.segment_map.types import (
     MapConfig,
@@ -55,7 +56,9 @@ def _among(rules, sensor, segment_map, measurements, T_world_nadir, most):
     if not sensor.propagate:
         spread = jnp.zeros_like(spread)
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
-    tilting = sensor.tilt_sigma**2 * measurements.tilt @ jnp.swapaxes(measurements.tilt, 1, 2)
+    tilting = (
+        sensor.tilt_sigma**2 * measurements.by_jitter @ jnp.swapaxes(measurements.by_jitter, 1, 2)
+    )
 
     # all M × K pairs, in numbers and not in 2×2 matrices: so they compile to one loop
     near, far = measurements.covariance + tilting, spread + drift
@@ -82,7 +85,7 @@ def _among(rules, sensor, segment_map, measurements, T_world_nadir, most):
         line=PolarLine(lines.rho[slot], lines.theta[slot]),
         apparent_scale=seen[slot, 2],
         precision=inverse_2x2(S),
-        precision_tilt=inverse_2x2(S + tilting[:, None]),
+        precision_with_jitter=inverse_2x2(S + tilting[:, None]),
         valid=jnp.isfinite(best),
     )
     return candidates, slot, best[:, 0]

@@ -19,7 +19,8 @@ from sofjax.geometry.lines import (
 from sofjax.geometry.matrices import inverse_2x2
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments, overlap, unit
-from sofjax.likelihood.measurements import Measurements, SensorModel
+from sofjax.likelihood.measurements import Measurements
+from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.segment_map.types import (
     MapConfig,
     SegmentMap,
@@ -105,10 +106,12 @@ def _measure(rules, sensor, m, measurements, together, tilt, T_world_nadir) -> _
         m.line, m.anchor, T_world_nadir
     )
     # by the map line's name: a measurement may be named from the other side
-    line, observed = PolarLine(expected[:, 0], expected[:, 1]), measurements.under_tilt(tilt)
+    line, observed = PolarLine(expected[:, 0], expected[:, 1]), measurements.without_jitter(tilt)
     innovation = -polar_difference(line, observed)
     drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
-    jitter = sensor.tilt_sigma**2 * measurements.tilt @ jnp.swapaxes(measurements.tilt, 1, 2)
+    jitter = (
+        sensor.tilt_sigma**2 * measurements.by_jitter @ jnp.swapaxes(measurements.by_jitter, 1, 2)
+    )
     noise = rename_covariance(
         measurements.covariance + TILT_LEFT * jitter, alignment(line, observed)
     )
@@ -214,7 +217,7 @@ def _insert(rules, m, measurements, new, tilt, T_world_nadir):
     new = new & some
     free = jnp.nonzero(~m.valid, size=M, fill_value=K)[0]
     slot = jnp.where(new, free[jnp.cumsum(new) - 1], K)
-    observed = measurements.under_tilt(tilt)
+    observed = measurements.without_jitter(tilt)
     line = jnp.stack([observed.rho, observed.theta, jnp.ones(M)], axis=1)
     covariance = jnp.zeros((M, 3, 3)).at[:, :2, :2].set(measurements.covariance)
     covariance = covariance.at[:, 2, 2].set(rules.scale_sigma**2)

@@ -1,10 +1,10 @@
 """Named settings: what is best, and the paper to the letter."""
 
 from sofjax.extraction.association import Association
-from sofjax.likelihood.measurements import SensorModel
+from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.motion import MotionModel
 from sofjax.segment_map import MapConfig
-from sofjax.slam.step import FilterConfig, SlamConfig
+from sofjax.slam.config import FilterConfig, SlamConfig
 
 DEFAULT = SlamConfig()
 

@@ -15,7 +15,7 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.motion import without_unread_motions
 from sofjax.segment_map import FinalMap, MapConfig, SegmentMap, is_off_floor, on_floor
-from sofjax.slam.step import SlamConfig
+from sofjax.slam.config import SlamConfig
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.association.duplicates import duplicates, representatives
 from sofjax.smoothing.association.extents import reaches

@@ -1,0 +1,74 @@
+"""Settings of the method, and what stays the same over a drive."""
+
+import equinox as eqx
+
+from sofjax._checks import check_fields
+from sofjax.extraction.association import Association
+from sofjax.geometry.camera import Camera, Mount
+from sofjax.likelihood.sensor_model import SensorModel
+from sofjax.motion import MotionModel
+from sofjax.segment_map import MapConfig
+
+CHOICES = ("resample", "winner")
+
+
+class FilterConfig(eqx.Module):
+    """How many particles, and how the next generation is chosen."""
+
+    particles: int = eqx.field(static=True, default=1000)  # N
+    choice: str = eqx.field(static=True, default="resample")  # or "winner", the paper's
+    effective_share: float = 0.5  # resample below this share of N
+    gate_each: bool = eqx.field(
+        static=True, default=False
+    )  # Fig. 6, step 4: SoF for every particle
+    soft: bool = eqx.field(static=True, default=False)  # densities to differentiate; see `run`
+    max_depth: float = 8.0  # metres: farther segments are not used
+
+    def __check_init__(self) -> None:
+        check_fields(
+            self,
+            choices={"choice": CHOICES},
+            whole_from={"particles": 1},
+            at_least_zero=("effective_share",),
+            positive=("max_depth",),
+        )
+
+
+class FixedLagConfig(eqx.Module):
+    """How many keyframes stay open while driving."""
+
+    keyframes: int = eqx.field(static=True, default=0)  # W; 0: none
+    lines: int = eqx.field(static=True, default=128)  # J, the nearest of the map are solved for
+    step: float = 0.2  # metres between keyframes ...
+    turn: float = 0.15  # ... or radians
+
+    def __check_init__(self) -> None:
+        check_fields(self, whole_from={"keyframes": 0, "lines": 1}, at_least_zero=("step", "turn"))
+
+
+class SlamConfig(eqx.Module):
+    """Every setting of the method, beside the part that reads it."""
+
+    association: Association = Association()
+    motion: MotionModel = MotionModel()
+    sensor: SensorModel = SensorModel()
+    segment_map: MapConfig = MapConfig()
+    filter: FilterConfig = FilterConfig()
+    window: FixedLagConfig = FixedLagConfig()
+
+
+class Setup(eqx.Module):
+    """What stays the same over a drive: the settings, the camera and where it is mounted."""
+
+    config: SlamConfig
+    camera: Camera
+    mount: Mount
+
+    def __check_init__(self) -> None:
+        for name, kind in (("config", SlamConfig), ("camera", Camera), ("mount", Mount)):
+            given = getattr(self, name)
+            if not isinstance(given, kind):
+                raise ValueError(
+                    f"{type(self).__name__}(config, camera, mount): {name} must be a "
+                    f"{kind.__name__}, not a {type(given).__name__}"
+                )

@@ -1,0 +1,52 @@
+"""Steps 1 to 3 of Fig. 6: the particles move by the odometer's reading and the motion model."""
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sofjax._pytree import in_any_run
+from sofjax.extraction.observation import Observation
+from sofjax.geometry.se2 import SE2
+from sofjax.motion import read_or_unknown, sample_motion, sample_slip, sample_unknown
+from sofjax.particles import Particles, mean_pose
+from sofjax.slam.config import Setup
+from sofjax.slam.state import SlamState
+
+SLIP_INFLATION = 1.5  # variance inflation up to which a slip of the wheels is tested
+
+
+class Predicted(eqx.Module):
+    """N particles after the reading and before the image."""
+
+    particles: Particles  # weighted by the prior
+    unslipped: Particles  # the same before the slips that some of them try
+    log_slip_ratio: Float[Array, "N"]  # log importance weight of those slips
+    T_world_robot: SE2  # their mean
+    odometer: SE2  # T_previous_current as read
+    unread_sigma: Float[Array, "3"]  # standard deviation of what was not read; metres, radians
+
+
+def predict(
+    setup: Setup,
+    state: SlamState,
+    observation: Observation,
+    key_motion: PRNGKeyArray,
+    key_slip: PRNGKeyArray,
+) -> Predicted:
+    """The particles of the last step, each moved by a draw of the motion model."""
+    motion_model, N = setup.config.motion, setup.config.filter.particles
+    odometer, unread = read_or_unknown(observation.motion, observation.motion_sigma)
+    motion, bias = sample_motion(motion_model, state.particles.bias, odometer, key_motion)
+    testable = state.variance_inflation < SLIP_INFLATION
+    slip, log_ratio = sample_slip(motion_model, odometer, testable, key_slip, N)
+    start = state.particles.T_world_robot
+    start = jax.lax.cond(
+        in_any_run((unread > 0).any()),
+        lambda: start @ sample_unknown(unread, jax.random.fold_in(key_motion, 1), N),
+        lambda: start,
+    )
+    unslipped = Particles(start @ motion, bias, state.particles.log_weight)
+    prior = state.particles.log_weight + log_ratio
+    T_world_robot = unslipped.T_world_robot @ slip
+    particles = Particles(T_world_robot, bias, prior - jax.nn.logsumexp(prior))
+    return Predicted(particles, unslipped, log_ratio, mean_pose(particles), odometer, unread)
