@@ -3,7 +3,17 @@
 import dataclasses
 from typing import Any
 
+import jax
 import numpy as np
+
+
+def value_of(a: Any) -> np.ndarray | None:
+    """The value of a number or an array; None where JAX traces it, maps over it or has it apart."""
+    if isinstance(a, jax.core.Tracer) or (isinstance(a, jax.Array) and not a.is_fully_addressable):
+        return None
+    if isinstance(a, int | float | np.ndarray | np.number | jax.Array):
+        return np.asarray(a)
+    return None
 
 
 def check_fields(
@@ -17,7 +27,7 @@ def check_fields(
 ) -> None:
     """Raise a ValueError that names class, field, value and what would be right.
 
-    Only plain numbers and NumPy arrays are judged. What JAX traces or maps over has no value yet.
+    Only values are judged: what JAX traces or maps over has none yet.
 
     **Arguments:**
     - `positive`, `at_least_zero`, `at_least_one`: fields that are numbers, and their range.
@@ -49,7 +59,6 @@ def check_fields(
             value = getattr(settings, field)
             if value is None or isinstance(value, bool | str):
                 refuse(field, right)
-            if isinstance(value, int | float | np.ndarray | np.number):
-                numbers = np.asarray(value, float)
-                if not (np.isfinite(numbers) & holds(numbers)).all():
-                    refuse(field, right)
+            numbers = value_of(value)
+            if numbers is not None and not (np.isfinite(numbers) & holds(numbers)).all():
+                refuse(field, right)

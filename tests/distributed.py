@@ -10,7 +10,7 @@ import pytest
 import test_slam
 from conftest import jit_quickly
 
-from sofjax import SofSlam, log_likelihood, slam
+from sofjax import LineNoise, SofSlam, log_likelihood, slam
 from sofjax.geometry import SE2, Segments
 
 T, N = 12, test_slam.N
@@ -53,7 +53,7 @@ def main():
     cloud = jnp.asarray(rng.normal(0, 0.05, size=(4096, 3)), "float32")
     particles = SE2(cloud[:, :2], cloud[:, 2])
     for soft in (False, True):
-        arguments = (0.05, 0.03, 9.0)
+        arguments = (LineNoise(0.05, 0.03, 9.0),)
         here = log_likelihood(particles, observed, segment_map, *arguments, soft=soft)
         there = log_likelihood(
             jax.device_put(particles, shared),

@@ -12,14 +12,17 @@ from sofjax.extraction.association import Association, association_error
 from sofjax.extraction.sof import put_on_floor
 from sofjax.geometry import SE2, Camera, Mount, Segments, floor_homography, two_view_homography
 from sofjax.geometry.two_view import transfer_segment
+from sofjax.likelihood import LineNoise
 from sofjax.likelihood.batch import (
+    culling,
     image_log_likelihood,
     log_likelihood,
     log_likelihood_pruned,
 )
 from sofjax.likelihood.batch.evaluate import _log_likelihood
 
-NOISE = (0.15, 0.08, 9.0)  # sigma_rho, sigma_theta, e_max
+NOISE = (0.15, 0.08, 9.0)  # rho_sigma, theta_sigma, e_max of the reference
+NOISY = LineNoise(*NOISE)
 
 
 # --- the reference: one particle at a time, every pair, the definition as it is written
@@ -108,7 +111,7 @@ def test_one_pair_by_hand(soft):
     particles = SE2(jnp.array([[1.0, 0.0]]), jnp.array([jnp.pi / 2]))
     wall = Segments(jnp.array([[[3.0, -5.0], [3.0, 5.0]]]), jnp.array([True]))
     seen = Segments(jnp.array([[[1.0, -2.3], [-1.0, -2.3]]]), jnp.array([True]))
-    got = log_likelihood(particles, seen, wall, 0.15, 0.08, 9.0, soft=soft)
+    got = log_likelihood(particles, seen, wall, NOISY, soft=soft)
     e = (0.3 / 0.15) ** 2
     assert_close(got, [np.log(np.exp(-4.5) + np.exp(-e / 2)) if soft else -e / 2], 1e-5)
 
@@ -122,7 +125,7 @@ SIZES = {"few": 9, "listed": 300}
 @pytest.mark.parametrize("N", SIZES.values(), ids=SIZES)
 def test_agrees_with_the_reference(N, soft):
     given = problem(N)
-    got = log_likelihood(*given, *NOISE, soft=soft)
+    got = log_likelihood(*given, NOISY, soft=soft)
     assert_close(got, reference(*given, *NOISE, soft=soft))
 
 
@@ -134,7 +137,7 @@ def test_masks_and_covariances_of_each_segment(N, soft):
         "used": jnp.asarray(np.random.default_rng(2).random((N, M)) > 0.4),
         "covariance": covariances(M),
     }
-    got = log_likelihood(*given, 0.05, 0.03, 7.0, soft=soft, **options)
+    got = log_likelihood(*given, LineNoise(0.05, 0.03, 7.0), soft=soft, **options)
     assert_close(got, reference(*given, 0.05, 0.03, 7.0, soft=soft, **options))
 
 
@@ -144,15 +147,15 @@ def test_headings_all_around_and_whole_turns(soft):
     particles, observed, segment_map = problem(300, spread=(3.0, 3.0, 2.0))
     turns = 2 * jnp.pi * jnp.asarray(np.random.default_rng(0).integers(-3, 4, 300), float)
     given = SE2(particles.xy, particles.yaw + turns), observed, segment_map
-    assert_close(log_likelihood(*given, *NOISE, soft=soft), reference(*given, *NOISE, soft=soft))
+    assert_close(log_likelihood(*given, NOISY, soft=soft), reference(*given, *NOISE, soft=soft))
 
 
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("spread", [(0.2, 0.2, 0.06), (5.0, 5.0, 3.0)], ids=["track", "global"])
 def test_pruned_is_every_pair(spread, soft):
     given = problem(300, spread=spread)
-    every = log_likelihood(*given, *NOISE, soft=soft, prune=False)
-    pruned, exact = log_likelihood_pruned(*given, *NOISE, soft=soft)
+    every = log_likelihood(*given, NOISY, soft=soft, prune=False)
+    pruned, exact = log_likelihood_pruned(*given, NOISY, soft=soft)
     assert bool(exact)
     assert_close(pruned, every, 1e-5)
 
@@ -160,32 +163,32 @@ def test_pruned_is_every_pair(spread, soft):
 def test_noise_too_wide_for_the_bounds_is_told_and_evaluated_in_full():
     given = problem(300)
     wide = (0.3, 0.9, 9.0)
-    assert not bool(log_likelihood_pruned(*given, *wide)[1])
-    assert_close(log_likelihood(*given, *wide), reference(*given, *wide))
+    assert not bool(log_likelihood_pruned(*given, LineNoise(*wide))[1])
+    assert_close(log_likelihood(*given, LineNoise(*wide)), reference(*given, *wide))
 
 
 def test_a_new_value_is_not_a_new_program():
     for shift in (0.0, 0.1):
         particles, observed, segment_map = problem(9, seed=int(10 * shift))
-        log_likelihood(particles, observed, segment_map, 0.1 + shift, 0.1, 9 + shift)
+        log_likelihood(particles, observed, segment_map, LineNoise(0.1 + shift, 0.1, 9 + shift))
         if shift == 0.0:
             before = _log_likelihood._cache_size()
     assert _log_likelihood._cache_size() == before
-    log_likelihood(*problem(10), *NOISE)
+    log_likelihood(*problem(10), NOISY)
     assert _log_likelihood._cache_size() == before + 1
 
 
 def test_a_batch_of_runs_is_one_vmap():
     runs = [problem(100, seed=seed) for seed in range(3)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runs)
-    together = jit_quickly(jax.vmap(lambda *run: log_likelihood(*run, *NOISE)))(*stacked)
+    together = jit_quickly(jax.vmap(lambda *run: log_likelihood(*run, NOISY)))(*stacked)
     assert_close(together, [reference(*run, *NOISE) for run in runs])
 
 
 def test_a_particle_that_is_lost_in_nan_spoils_no_other():
     particles, observed, segment_map = problem(300)
     xy = particles.xy.at[7].set(jnp.nan)
-    got = log_likelihood(SE2(xy, particles.yaw), observed, segment_map, *NOISE)
+    got = jit_quickly(log_likelihood)(SE2(xy, particles.yaw), observed, segment_map, NOISY)
     want = reference(particles, observed, segment_map, *NOISE)
     others = np.arange(300) != 7
     assert_close(got[others], want[others])
@@ -229,7 +232,7 @@ DEGENERATE = [
 def test_degenerate_inputs(name, soft):
     for N in SIZES.values():
         given = degenerate(name, N)
-        got = log_likelihood(*given, *NOISE, soft=soft)
+        got = log_likelihood(*given, NOISY, soft=soft)
         assert_close(got, reference(*given, *NOISE, soft=soft))
 
 
@@ -250,7 +253,7 @@ def gradients(at, seen_valid, map_valid):
     def total(at):
         particles, seen, ends, noise = at
         given = particles, Segments(seen, seen_valid), Segments(ends, map_valid)
-        return log_likelihood(*given, *noise, soft=True).sum()
+        return log_likelihood(*given, LineNoise(*noise), soft=True).sum()
 
     return jax.jvp(jax.grad(total), (at,), (jax.tree.map(jnp.ones_like, at),))
 
@@ -264,7 +267,7 @@ STEP = 1e-6  # of the differences
 @pytest.fixture
 def short_programs(monkeypatch, x64):
     """Groups of two pairs, so that compiling does not take longer than all else; in float64."""
-    monkeypatch.setattr(reach, "_group_size", lambda K, prune: 2)
+    monkeypatch.setattr(culling, "_group_size", lambda K, prune: 2)
 
 
 def assert_derivatives(total, at):
@@ -304,7 +307,7 @@ def test_gradient_by_everything_is_the_difference_quotient():
     def total(at):
         return log_likelihood(
             at["particles"], Segments(at["seen"], observed.valid),
-            Segments(at["map"], segment_map.valid), *at["noise"],
+            Segments(at["map"], segment_map.valid), LineNoise(*at["noise"]),
             soft=True, covariance=at["covariance"],
         ).sum()  # fmt: skip
 
@@ -320,7 +323,7 @@ def test_second_derivatives_of_a_whole_cloud():
         def total(particles):
             moved = Segments(at["map"], segment_map.valid)
             noise = at["sigma"], 0.08, 9.0
-            return log_likelihood(particles, observed, moved, *noise, soft=True).sum()
+            return log_likelihood(particles, observed, moved, LineNoise(*noise), soft=True).sum()
 
         gradient = jax.grad(total)(at["particles"])
         return gradient.xy.sum() + gradient.yaw.sum()
@@ -341,7 +344,7 @@ def test_hessian_of_a_pose_gives_its_laplace_covariance():
 
     def cost(pose):
         one = SE2(pose[None, :2], pose[2:])
-        return -log_likelihood(one, observed, segment_map, *NOISE, soft=True)[0]
+        return -log_likelihood(one, observed, segment_map, NOISY, soft=True)[0]
 
     gradient, hessian = jit_quickly(jax.grad(cost)), jit_quickly(jax.hessian(cost))
     for _ in range(20):
@@ -359,7 +362,7 @@ def test_hessian_of_a_pose_gives_its_laplace_covariance():
 def test_gradient_at_full_size_under_jit():
     """10,000 x 30 x 100 in float32: backwards, forwards and a float64 difference quotient."""
     particles, observed, segment_map = problem(10_000, 30, 100, seed=6)
-    total = lambda P: log_likelihood(P, observed, segment_map, *NOISE, soft=True)
+    total = lambda P: log_likelihood(P, observed, segment_map, NOISY, soft=True)
     backward = jax.jit(jax.grad(lambda P: total(P).sum()))(particles)
 
     @jax.jit
@@ -397,7 +400,7 @@ def scratch(size, **options):
     given = SE2(jnp.zeros((N, 2)), jnp.zeros(N)), segments(M), segments(K)
 
     def call(*given):
-        function = lambda *given: log_likelihood(*given, *NOISE, **options)
+        function = lambda *given: log_likelihood(*given, NOISY, **options)
         if options.get("soft"):
             return jax.grad(lambda *given: function(*given).sum())(*given)
         return function(*given)
@@ -435,8 +438,11 @@ def image_problem(N):
 
 
 def test_image_log_likelihood_puts_the_segments_on_the_floor():
-    mount, particles, image, segment_map = image_problem(20)
-    got = image_log_likelihood(make_camera(), mount, particles, image, segment_map, *NOISE)
+    mount, *given = image_problem(20)
+    particles, image, segment_map = given
+    got = image_log_likelihood(
+        make_camera(), mount, particles, image, segment_map, NOISY, soft=True
+    )
     on_floor = put_on_floor(make_camera(), mount, image, 8.0)
     assert not bool(on_floor.valid[0])
     assert_close(got, reference(particles, on_floor, segment_map, *NOISE, soft=True))
@@ -448,7 +454,7 @@ def test_gradient_by_the_mount_is_the_difference_quotient():
 
     def total(at):
         given = particles, image, segment_map
-        return image_log_likelihood(make_camera(), at["mount"], *given, *NOISE).sum()
+        return image_log_likelihood(make_camera(), at["mount"], *given, NOISY, soft=True).sum()
 
     assert_derivatives(total, {"mount": mount})
 

@@ -27,6 +27,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 
 import sofjax
+from sofjax import LineNoise
 from sofjax.geometry import (
     SE2,
     Camera,
@@ -92,20 +93,20 @@ def arguments(problem: dict):
         SE2(xyt[:, :2], xyt[:, 2]),
         segments("observed", "observed_valid"),
         segments("map", "map_valid"),
-        *(jnp.asarray(problem[name], jnp.float32) for name in noise),
+        LineNoise(*(jnp.asarray(problem[name], jnp.float32) for name in noise)),
     )
 
 
 # -- the forms -------------------------------------------------------------------------------------
 
 
-def naive(particles, observed, segment_map, sigma_rho, sigma_theta, e_max):
+def naive(particles, observed, segment_map, noise):
     """The definition for one pair, under three vmaps."""
 
     def pair(pose, seen, seen_valid, line, line_valid):
         moved = pose.inverse().apply(line)
         d = polar_difference(polar_through(seen), polar_through(moved))
-        e = (d[0] / sigma_rho) ** 2 + (d[1] / sigma_theta) ** 2
+        e = (d[0] / noise.rho_sigma) ** 2 + (d[1] / noise.theta_sigma) ** 2
         return jnp.where((overlap(moved, seen) > 0) & line_valid & seen_valid, e, jnp.inf)
 
     over_map = jax.vmap(pair, in_axes=(None, None, None, 0, 0))
@@ -113,7 +114,7 @@ def naive(particles, observed, segment_map, sigma_rho, sigma_theta, e_max):
     e = jax.vmap(over_seen, in_axes=(0, None, None, None, None))(
         particles, observed.endpoints, observed.valid, segment_map.endpoints, segment_map.valid
     )
-    cost = jnp.minimum(e.min(axis=-1), e_max)
+    cost = jnp.minimum(e.min(axis=-1), noise.e_max)
     return -0.5 * jnp.where(observed.valid, cost, 0).sum(axis=-1)
 
 
@@ -156,11 +157,11 @@ def by_pose(*arguments):
     return values, gradient
 
 
-def of_image(height_pitch, camera, mount, segments_image, particles, segment_map, *noise):
+def of_image(height_pitch, camera, mount, segments_image, particles, segment_map, noise):
     """The soft form as a function of the mount."""
     mount = Mount(mount.x, mount.y, *height_pitch, mount.roll, mount.yaw)
     return sofjax.image_log_likelihood(
-        camera, mount, particles, segments_image, segment_map, *noise, max_depth=30.0
+        camera, mount, particles, segments_image, segment_map, noise, max_depth=30.0, soft=True
     )
 
 

@@ -114,7 +114,7 @@ def extract_along(
     with.
     """
 
-    def next_image(carry, observation):
+    def next_image(carry: tuple[SE2, View, View], observation: Observation) -> tuple:
         T_world_robot, recent, reference = carry
         T_world_robot = T_world_robot @ observation.motion
         view = view_a_baseline_away(config, recent, reference, T_world_robot)

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from sofjax.geometry.angles import safe_divide, safe_norm
 from sofjax.geometry.se2 import SE2
@@ -16,6 +16,12 @@ class Segments(eqx.Module):
 
     endpoints: Float[Array, "*batch 2 2"]
     valid: Bool[Array, "*batch"]
+
+    @staticmethod
+    def of(endpoints: ArrayLike | list) -> "Segments":
+        """Segments from end points [*batch, 2, 2], all of them valid."""
+        ends = jnp.asarray(endpoints, float)
+        return Segments(ends, jnp.ones(ends.shape[:-2], bool))
 
     def transform(self, T_a_b: SE2) -> "Segments":
         """Segments of frame b in frame a."""

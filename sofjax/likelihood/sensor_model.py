@@ -48,7 +48,7 @@ class SensorModel(eqx.Module):
     noise_max: float = 1e4  # ... up to here it only lessens the weight of the measurements
     e_max: float = 9.0  # outlier cost: of an observed segment that matches nothing
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         check_fields(
             self,
             at_least_zero=("tilt_sigma", "upright", "adaptation"),
@@ -58,19 +58,21 @@ class SensorModel(eqx.Module):
 
 
 class LineNoise(eqx.Module):
-    """Constant noise of a segment in (rho, theta), and the outlier cost: the paper's three numbers.
+    """Constant noise of a segment in (rho, theta), and the outlier cost; for `log_likelihood`.
 
     **Arguments:**
     - `rho_sigma`, `theta_sigma`: standard deviations, metres and radians.
     - `e_max`: the cost of an observed segment that explains nothing.
+    - `gap_scale`: tau, metres: how fast the soft form forgets a pair that does not overlap.
     """
 
     rho_sigma: Scalar
     theta_sigma: Scalar
     e_max: Scalar = 9.0
+    gap_scale: Scalar = 0.05
 
-    def __check_init__(self):
-        check_fields(self, positive=("rho_sigma", "theta_sigma", "e_max"))
+    def __check_init__(self) -> None:
+        check_fields(self, positive=("rho_sigma", "theta_sigma", "e_max", "gap_scale"))
 
 
 def squared_error(W: Sequence[Array] | Array, d_rho: Array, d_theta: Array) -> Array:

@@ -87,25 +87,38 @@ def reach(
             jnp.abs(jnp.abs(rho) - jnp.abs(seen.rho)[:, None]),
         )
         listed &= difference <= jnp.abs(nx) * dx + jnp.abs(ny) * dy + cut_rho[:, None]
-
-        middle = (lines.first + lines.second) / 2
-        half = jnp.hypot(*(lines.second - middle).T)
-        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-        direction = jnp.stack([cos * seen.cos - sin * seen.sin, sin * seen.cos + cos * seen.sin], 1)
-        between = jnp.abs(direction @ middle.T - seen.along[:, None])
-        swing = d_yaw * (jnp.hypot(*middle.T) + reach_xy)
-        far = seen.half[:, None] + half + reach_xy + swing + gap_cut + rounding
-        listed &= jnp.tile(between <= far, 3)
+        listed &= _within(seen, lines, yaw, d_yaw, reach_xy, gap_cut + rounding)
     listed &= matchable & seen.matchable[:, None]
 
-    M, K = len(seen.rho), len(lines.rho)
-    size = _group_size(K, prune)
-    room = -(-2 * K // size) * size
+    index, count = _in_groups(listed, _group_size(len(lines.rho), prune))
+    return Reach(_with_none(live), index, count, centre, turn, side)
+
+
+def _within(
+    seen: Seen, lines: Lines, yaw: Array, d_yaw: Array, reach_xy: Array, margin: Array
+) -> Bool[Array, "M R"]:
+    """Whether a pair's middles may come so near along the observed segment that the two overlap."""
+    middle = (lines.first + lines.second) / 2
+    half = jnp.hypot(*(lines.second - middle).T)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    direction = jnp.stack([cos * seen.cos - sin * seen.sin, sin * seen.cos + cos * seen.sin], 1)
+    between = jnp.abs(direction @ middle.T - seen.along[:, None])
+    swing = d_yaw * (jnp.hypot(*middle.T) + reach_xy)
+    far = seen.half[:, None] + half + reach_xy + swing + margin
+    return jnp.tile(between <= far, 3)
+
+
+def _in_groups(
+    listed: Bool[Array, "M R"], size: int
+) -> tuple[Int[Array, "M groups size"], Int[Array, "M"]]:
+    """The listed rows of each observed segment in groups, R where there is none; and how many."""
+    M, R = listed.shape
+    capacity = -(-2 * (R // 3) // size) * size
     rank = jnp.cumsum(listed, axis=1)
-    slot = jnp.where(listed, rank - 1, room)
-    none = jnp.full((M, room), 3 * K)
-    index = none.at[jnp.arange(M)[:, None], slot].set(jnp.arange(3 * K), mode="drop")
-    return Reach(_with_none(live), index.reshape(M, -1, size), rank[:, -1], centre, turn, side)
+    slot = jnp.where(listed, rank - 1, capacity)
+    none = jnp.full((M, capacity), R)
+    index = none.at[jnp.arange(M)[:, None], slot].set(jnp.arange(R), mode="drop")
+    return index.reshape(M, -1, size), rank[:, -1]
 
 
 def _group_size(K: int, prune: bool) -> int:
@@ -130,7 +143,7 @@ def _under_three_names(lines: Lines) -> Float[Array, "R 8"]:
     forward = jnp.concatenate([lines.normal, lines.first, lines.second], axis=1)
     reverse = jnp.concatenate([-lines.normal, lines.second, lines.first], axis=1)
 
-    def named(half_turns):
+    def named(half_turns: int) -> Array:
         other = back if half_turns == 0 else ~back
         rho = jnp.where(other, -lines.rho, lines.rho)
         head = jnp.stack([theta + half_turns * jnp.pi, rho], axis=1)

@@ -4,12 +4,15 @@ All N particles go through a group in one fused loop, particles minor, and only 
 is kept. Nothing of the size N·M·K, nor N·K, ever exists.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from sofjax.likelihood.batch.culling import Reach
 from sofjax.likelihood.batch.prepare import Cloud, Seen, larger
@@ -63,7 +66,7 @@ def row(
     )  # fmt: skip
 
 
-def whitened(row: Row, line: Float[Array, "8"]):
+def whitened(row: Row, line: Float[Array, "8"]) -> tuple[Array, Array]:
     """The two residuals of a pair whose squares add up to e."""
     theta, rho, nx, ny = line[:4]
     if row.b is None:
@@ -73,24 +76,26 @@ def whitened(row: Row, line: Float[Array, "8"]):
     return z_rho, row.c * d_theta
 
 
-def gaps(row: Row, line: Float[Array, "8"]):
+def gaps(row: Row, line: Float[Array, "8"]) -> tuple[Array, Array]:
     """How far the map segment begins past the observed one's end, and ends before its beginning."""
     x1, y1, x2, y2 = line[4:]
     return row.dx * x1 + (row.dy * y1 - row.end), row.begin - row.dy * y2 - row.dx * x2
 
 
-def over_groups(near: Reach, m: Int[Array, ""], start, add):
+def over_groups(
+    near: Reach, m: Int[Array, ""], start: PyTree, add: Callable[[Any, Array], PyTree]
+) -> PyTree:
     """`add(carry, lines [size, 8])` for every group of map segments within reach of segment m."""
     size = near.index.shape[2]
 
-    def step(carry):
+    def step(carry: tuple) -> tuple:
         g, value = carry
         return g + 1, add(value, near.table[near.index[m, g]])
 
     return lax.while_loop(lambda carry: carry[0] * size < near.count[m], step, (0, start))[1]
 
 
-def over_observed(near: Reach, start, add):
+def over_observed(near: Reach, start: PyTree, add: Callable[[Any, Array], PyTree]) -> PyTree:
     """`add(carry, m)` for every observed segment that anything is within reach of."""
     some = near.count > 0
     chosen = jnp.nonzero(some, size=len(some))[0]
@@ -114,10 +119,10 @@ def hard(
     trigonometry = jnp.cos(cloud.yaw), jnp.sin(cloud.yaw)
     zero = jnp.zeros_like(cloud.x)
 
-    def one(total, m):
+    def one(total: Array, m: Array) -> Array:
         r = row(cloud, trigonometry, seen, near, m, WALL, diagonal)
 
-        def add(best, lines):
+        def add(best: Array, lines: Array) -> Array:
             for line in lines:
                 z_rho, z_theta = whitened(r, line)
                 past, before = gaps(r, line)

@@ -101,11 +101,11 @@ def prepare(
     return cloud, seen, Lines(theta, rho, normal, local[:, 0], local[:, 1], length > 0)
 
 
-def _without_padding(segments):
+def _without_padding(segments: Segments) -> Float[Array, "n 2 2"]:
     return jnp.where(segments.valid[:, None, None], segments.endpoints, 0)
 
 
-def _line(endpoints):
+def _line(endpoints: Float[Array, "n 2 2"]) -> tuple[Array, Array, Array, Array, Array]:
     """Angle, the middle's coordinates along and across the line, length and unit vector."""
     d = endpoints[:, 1] - endpoints[:, 0]
     middle = (endpoints[:, 0] + endpoints[:, 1]) / 2

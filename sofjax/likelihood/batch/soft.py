@@ -12,17 +12,21 @@ by the map take a loop of their own.
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from sofjax.likelihood.batch.culling import reach
-from sofjax.likelihood.batch.kernels import gaps, over_groups, over_observed, row, whitened
+from sofjax.likelihood.batch.kernels import Row, gaps, over_groups, over_observed, row, whitened
 from sofjax.likelihood.batch.prepare import Cloud, Lines, Seen, compare_pairs
+
+Sums = dict[str, Array]
+Twins = dict[tuple[str, str], Array]
 
 NEGLIGIBLE = 28.0  # in e: a pair this far beyond e_max adds less than a millionth to the sum
 
@@ -45,17 +49,17 @@ def soft(
     - `tau`: metres; without derivative.
     - `counts`: weight of each observed segment, for each particle or for all.
     """
-    return _one_pass(diagonal, prune, cloud, seen, lines, e_max, tau, counts, ())[0]
+    return _one_pass((diagonal, prune), (), cloud, seen, lines, e_max, tau, counts)[0]
 
 
 @functools.partial(soft.defjvp, symbolic_zeros=True)
-def _soft_jvp(diagonal, prune, primals, tangents):
+def _soft_jvp(diagonal: bool, prune: bool, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     cloud, seen, lines, e_max, tau, counts = primals
     d_cloud, d_seen, d_lines, d_e_max, _, _ = tangents
     by_noise = _moves([d_seen.a, d_seen.b, d_seen.c])
     by_place = _moves([d_seen.theta, d_seen.rho, d_seen.along, d_seen.half])
     wanted = ("pose",) * _moves(d_cloud) + ("place",) * by_place + ("noise",) * by_noise
-    value, by_e_max, by_pose, by_seen = _one_pass(diagonal, prune, *primals, wanted)
+    value, by_e_max, by_pose, by_seen = _one_pass((diagonal, prune), wanted, *primals)
 
     # cos and sin of theta move with theta, and have no share of their own
     tangent = by_e_max * _dense(d_e_max)
@@ -74,19 +78,29 @@ def _soft_jvp(diagonal, prune, primals, tangents):
     return value, tangent
 
 
-def _moves(tangents):
+def _moves(tangents: PyTree) -> bool:
     is_zero = lambda leaf: isinstance(leaf, SymbolicZero)
     return not all(map(is_zero, jax.tree.leaves(tangents, is_leaf=is_zero)))
 
 
-def _dense(tangent):
+def _dense(tangent: Any) -> Any:
     if isinstance(tangent, SymbolicZero):
         return jnp.zeros(tangent.shape, tangent.dtype)
     return tangent
 
 
-def _one_pass(diagonal, prune, cloud, seen, lines, e_max, tau, counts, wanted):
+def _one_pass(
+    form: tuple[bool, bool],
+    wanted: tuple[str, ...],
+    cloud: Cloud,
+    seen: Seen,
+    lines: Lines,
+    e_max: Array,
+    tau: Array,
+    counts: Array,
+) -> tuple[Array, Array, dict[str, Array], dict[str, Array]]:
     """Value, and its derivatives by e_max and the pose [N], by the fields of `seen` [M, N]."""
+    diagonal, prune = form
     e_cut = e_max + NEGLIGIBLE + 2 * math.log(max(len(lines.rho), 1))
     near = reach(cloud, seen, lines, e_cut, tau * jnp.sqrt(e_cut), prune, diagonal)
     trigonometry = jnp.cos(cloud.yaw), jnp.sin(cloud.yaw)
@@ -100,7 +114,7 @@ def _one_pass(diagonal, prune, cloud, seen, lines, e_max, tau, counts, wanted):
     sums += ["z", "length"] if "place" in wanted else []
     sums += ["zz", "zt", "tt"] if "noise" in wanted else []
 
-    def one(carry, m):
+    def one(carry: tuple, m: Array) -> tuple:
         value, by_e_max, by_pose, by_seen = carry
         r = row(cloud, trigonometry, seen, near, m, 1 / tau, diagonal)
         start = _pair_up({name: zero for name in sums})
@@ -142,14 +156,14 @@ def _one_pass(diagonal, prune, cloud, seen, lines, e_max, tau, counts, wanted):
     return over_observed(near, start, one)
 
 
-def _add(total, group, r, e_max):
+def _add(total: Sums, group: Array, r: Row, e_max: Array) -> Sums:
     """The sums over k that are in `total`, with one group of map segments added."""
     right = r.c * (np.pi / 2)
     across = r.dy * r.x - r.dx * r.y
     b = 0.0 if r.b is None else r.b
     a = 1.0 if r.b is None else r.a  # the table has it already
 
-    def terms(line):
+    def terms(line: Array) -> Sums:
         """u, and u times half the derivatives of -(e + (gap / tau)²) and what makes them up."""
         z_rho, z_theta = whitened(r, line)
         past, before = (jnp.where(gap > 0, gap, 0) for gap in gaps(r, line))  # one of them is 0
@@ -182,19 +196,21 @@ def _add(total, group, r, e_max):
 TWINS = (("x", "y"), ("theta", "gap"), ("z", "length"), ("zz", "tt"))
 
 
-def _pair_up(sums):
+def _pair_up(sums: Sums) -> tuple[Sums, Twins]:
     twins = {pair: lax.complex(*(sums[name] for name in pair)) for pair in TWINS if pair[0] in sums}
     return {name: sums[name] for name in ("u", "zt") if name in sums}, twins
 
 
-def _apart(carried):
+def _apart(carried: tuple[Sums, Twins]) -> Sums:
     singles, twins = carried
     for (first, second), value in twins.items():
         singles = singles | {first: lax.real(value), second: lax.imag(value)}
     return singles
 
 
-def _by_map(lines, cloud, seen, e_max, tau, counts):
+def _by_map(
+    lines: Lines, cloud: Cloud, seen: Seen, e_max: Array, tau: Array, counts: Array
+) -> Float[Array, "N"]:
     """The same value by plain JAX, one map segment at a time, for the derivatives by the map.
 
     Only the [M, N] sum is carried. It is linear in what a step adds, so going back needs no copy of
@@ -203,7 +219,7 @@ def _by_map(lines, cloud, seen, e_max, tau, counts):
     across = jax.tree.map(lambda leaf: leaf[:, None], seen)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)  # True gave wrong gradients under jit
-    def u(line):
+    def u(line: Lines) -> Array:
         return soft_weight(cloud, across, line, e_max, tau)
 
     total = jnp.zeros((len(seen.rho), len(cloud.x)), cloud.x.dtype)
@@ -211,7 +227,7 @@ def _by_map(lines, cloud, seen, e_max, tau, counts):
     return (counts * (jnp.log1p(total) - 0.5 * e_max)).sum(axis=0)
 
 
-def soft_weight(cloud, seen, line, e_max, tau):
+def soft_weight(cloud: Cloud, seen: Seen, line: Lines, e_max: Array, tau: Array) -> Array:
     """exp((e_max - e - (gap / tau)²) / 2) of pairs that broadcast."""
     z_rho, z_theta, past, before = compare_pairs(cloud, seen, line)
     gap = (jnp.maximum(past, 0) + jnp.maximum(before, 0)) / tau
