@@ -18,7 +18,7 @@ from scipy.stats import t
 
 from sofjax import PRESETS, slam
 from sofjax.evaluation import evaluate_trajectory
-from sofjax.extraction.observation import Observation
+from sofjax.extraction import Observation
 from sofjax.geometry import SE2, Camera, Mount
 from sofjax.io.trajectory import Trajectory
 from sofjax.simulation import (

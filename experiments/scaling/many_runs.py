@@ -21,7 +21,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax.extraction.observation import Observation
+from sofjax.extraction import Observation
 
 TOGETHER = 16  # runs side by side on a core: what they work on then fits into its cache
 
