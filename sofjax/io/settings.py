@@ -1,7 +1,7 @@
 """Settings as names with dots: from TOML and the command line into frozen dataclasses, and back.
 
 A setting is a leaf of a tree of dataclasses, `motion.distance_noise`; its default tells its type.
-A field with `INLINE` as its metadata lends its own fields to the level above.
+The settings of a field with `INLINE` as its metadata are named as if they were of the level above.
 """
 
 import dataclasses
@@ -28,12 +28,18 @@ def to_dict(config: Any) -> dict[str, Setting]:
     return dict(_leaves(config, ""))
 
 
-def with_settings(config: Config, given: Mapping[str, object], where: str) -> Config:
+def with_settings(
+    config: Config,
+    given: Mapping[str, object],
+    where: str,
+    check: Callable[[str, Setting], None] | None = None,
+) -> Config:
     """The same settings with some of them changed.
 
     **Arguments:**
     - `given`: values by name, of the setting's type, or as text from the command line.
     - `where`: the file or option, for the sentence of an `InputError`.
+    - `check`: raises `ValueError` for a name's value that cannot be used.
     """
     known = to_dict(config)
     values = {}
@@ -42,6 +48,9 @@ def with_settings(config: Config, given: Mapping[str, object], where: str) -> Co
             raise InputError(f"{where}: there is no setting {quoted(name)}; {nearest(name, known)}")
         values[name] = _cast(f"{where}: '{name}'", value, known[name])
     try:
+        for name, value in values.items():
+            if check is not None:
+                check(name, value)
         return _replace(config, values, "")
     except InputError:
         raise
