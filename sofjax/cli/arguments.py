@@ -3,13 +3,13 @@
 import argparse
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from sofjax.cli import arguments_simulate
 from sofjax.pipeline.outcomes import LOOPS
 
 if TYPE_CHECKING:
-    Commands = argparse._SubParsersAction[argparse.ArgumentParser]
+    Commands = argparse._SubParsersAction[Any]
 
 QUOTED = 200  # characters of the message of a word that is no option
 # calibration.UNKNOWNS and vision.boards.PATTERNS, which would take the parser a second to import

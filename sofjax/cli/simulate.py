@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import re
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from sofjax.io.errors import InputError, nearest, quoted
@@ -31,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     imaging.check()
     ride = take_ride(world, rig, args.seed, args.images)
 
-    def progress(frames: list) -> tqdm:
+    def progress(frames: Iterable) -> Iterable:
         return tqdm(frames, desc=args.out.name, unit=" images", disable=None)
 
     record(args.out, world, rig, ride, imaging, args.seed, progress)

@@ -10,13 +10,16 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sofjax.io.errors import InputError, nearest, plain, quoted
 from sofjax.io.numbers import decimal, whole
 from sofjax.io.text import SETTINGS_BYTES, read_text
 
-Config = TypeVar("Config")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Config = TypeVar("Config", bound="DataclassInstance")  # frozen
 Setting = bool | int | float | str
 
 INLINE = {"inline": True}
@@ -96,8 +99,8 @@ def _leaves(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 def _replace(config: Config, values: Mapping[str, Setting], prefix: str) -> Config:
     changed = {}
     for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if dataclasses.is_dataclass(value):
+        value: Any = getattr(config, field.name)
+        if dataclasses.is_dataclass(type(value)):
             changed[field.name] = _replace(value, values, _below(field, prefix))
         else:
             changed[field.name] = values.get(prefix + field.name, value)
@@ -118,24 +121,25 @@ def _flatten(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, ob
 
 def _cast(where: str, value: object, like: Setting) -> Setting:
     """A value as the type of the setting's present one; bool before int, which it also is."""
-    text = isinstance(value, str)
     if isinstance(like, bool):
-        value = {"true": True, "false": False}.get(value.lower(), value) if text else value
+        if isinstance(value, str):
+            value = {"true": True, "false": False}.get(value.lower(), value)
         if isinstance(value, bool):
             return value
         right = "true or false"
     elif isinstance(like, int):
-        number = _parsed(whole, value) if text else value
-        if type(number) is int:
+        number = _parsed(whole, value) if isinstance(value, str) else value
+        if isinstance(number, int) and not isinstance(number, bool):
             return number
         right = "a whole number"
     elif isinstance(like, float):
-        number = _parsed(decimal, value) if text else value
-        if type(number) in (int, float) and abs(number) <= sys.float_info.max:
-            return float(number)
+        number = _parsed(decimal, value) if isinstance(value, str) else value
+        if isinstance(number, int | float) and not isinstance(number, bool):
+            if abs(number) <= sys.float_info.max:
+                return float(number)
         right = "a finite number"
     else:
-        if text:
+        if isinstance(value, str):
             return value
         right = "text"
     raise InputError(f"{where} is {quoted(value)}; it must be {right}")

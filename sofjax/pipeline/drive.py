@@ -71,7 +71,7 @@ def run_drive(
 class _Stopwatch:
     """The seconds that each stage took."""
 
-    def __init__(self, begun: float | None):
+    def __init__(self, begun: float | None) -> None:
         self.seconds: dict[str, float] = {}
         self._lapped = time.perf_counter() if begun is None else begun
 

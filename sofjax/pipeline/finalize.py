@@ -64,7 +64,9 @@ def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
     return Closed(
         Trajectory(path.stamps, motion.apply(path.xy), path.yaw + motion.yaw),
         eqx.tree_at(
-            lambda f: f.endpoints_world, closed.final, motion.apply(closed.final.endpoints_world)
+            lambda f: f.endpoints_world,
+            closed.final,
+            motion.apply(np.asarray(closed.final.endpoints_world)),
         ),
         motion.apply(closed.places),
         motion.R @ closed.covariances @ motion.R.T,
@@ -87,8 +89,8 @@ def _smooth(driven: Driven, observations: Observation, path: smoothing.Path) -> 
     return Closed(
         Trajectory(np.array(run_log.stamps), np.asarray(T.xy), np.unwrap(T.yaw)),
         final,
-        solution.unknowns.pose[:n, :2],
-        solution.pose_covariance[:n, :2, :2],
+        np.asarray(solution.unknowns.pose)[:n, :2],
+        np.asarray(solution.pose_covariance)[:n, :2, :2],
         _revisits_report(asked, run_log)
         | {
             "keyframes": n,

@@ -41,7 +41,7 @@ def open_run(out: Path | None, drive: Drive, settings: RunSettings) -> "Iterator
 class RunWriter:
     """Writes into the folder of a run what `run_drive` hands to it; without a folder, nothing."""
 
-    def __init__(self, folder: Path | None = None):
+    def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder
         self.calibration: dict[str, object] | None = None  # for the report
 

@@ -62,7 +62,7 @@ class Frontend:
         settings: FrontendSettings | None = None,
         detector: Detector | None = None,
         bits: int | None = None,
-    ):
+    ) -> None:
         """**Arguments:**
         - `detector`: one's own, in the place of the one that the settings name.
         - `bits`: of images of 16 bits, as of `read_image`.
