@@ -10,16 +10,13 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from sofjax.io.errors import InputError, nearest, plain, quoted
 from sofjax.io.numbers import decimal, whole
 from sofjax.io.text import SETTINGS_BYTES, read_text
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Config = TypeVar("Config", bound="DataclassInstance")  # frozen
+Config = TypeVar("Config")  # a frozen dataclass
 Setting = bool | int | float | str
 
 INLINE = {"inline": True}
@@ -98,13 +95,13 @@ def _leaves(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 
 def _replace(config: Config, values: Mapping[str, Setting], prefix: str) -> Config:
     changed = {}
-    for field in dataclasses.fields(config):
+    for field in dataclasses.fields(cast(Any, config)):
         value: Any = getattr(config, field.name)
         if dataclasses.is_dataclass(type(value)):
             changed[field.name] = _replace(value, values, _below(field, prefix))
         else:
             changed[field.name] = values.get(prefix + field.name, value)
-    return dataclasses.replace(config, **changed)
+    return dataclasses.replace(cast(Any, config), **changed)
 
 
 def _below(field: dataclasses.Field, prefix: str) -> str:
