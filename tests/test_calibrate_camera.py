@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sofjax import viewer
-from sofjax.cli import calibrate_camera, main
+from sofjax.cli import arguments, main
 from sofjax.io.camera_file import known_mount, mount_fields, read_camera
 from sofjax.io.drive import read_drive
 from sofjax.io.errors import InputError
@@ -380,7 +380,7 @@ def test_a_pattern_that_is_not_there(refused, boards, args, sentence):
 
 
 def test_the_command_offers_every_pattern():
-    assert calibrate_camera.PATTERNS == PATTERNS
+    assert arguments.PATTERNS == PATTERNS
 
 
 @pytest.mark.parametrize("square", ["0", "-0.03", "nan", "inf", "30"])

@@ -11,7 +11,8 @@ import pytest
 
 from sofjax.calibration import UNKNOWNS
 from sofjax.cli import main
-from sofjax.cli.calibrate_mount import FREE, free_names
+from sofjax.cli.arguments import FREE
+from sofjax.cli.calibrate_mount import free_names
 from sofjax.geometry import Mount
 from sofjax.io.camera_file import read_camera
 from sofjax.vision import rectify

@@ -16,11 +16,13 @@ import pytest
 
 from sofjax import viewer
 from sofjax.cli import main
-from sofjax.cli.run import views
+from sofjax.cli.arguments import make_parser
+from sofjax.cli.run import settings_of
 from sofjax.io.drive import motions, read_drive
 from sofjax.io.map_file import read_map
 from sofjax.io.trajectory import read_trajectory
 from sofjax.pipeline import results
+from sofjax.pipeline.online import views
 from sofjax.pipeline.run_log import RunLog
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
@@ -137,18 +139,14 @@ def test_another_seed_gives_another_trajectory(done, drive, tmp_path):
 
 
 def test_settings_come_from_the_preset_the_file_and_the_options_in_this_order(drive, tmp_path):
-    from sofjax.pipeline.settings import gather
-
     def gathered(*args):
-        from sofjax.cli.main import _parser
-
-        return gather(_parser().parse_args(["run", str(drive), *map(str, args)]))
+        return settings_of(make_parser().parse_args(["run", str(drive), *map(str, args)]))
 
     assert gathered().frontend.detector == "lsd" and gathered().loop == "smooth"
     assert gathered("--set", "preset=paper").loop == "none"
     assert gathered("--set", "preset=paper", "--loop", "smooth").loop == "smooth"
     assert gathered("--set", "preset=paper").frontend.detector == "hough"
-    recall = lambda *args: gathered(*args).slam.segment_map.recall
+    recall = lambda *args: gathered(*args).used.slam.segment_map.recall
     assert recall("--loop", "paper") == 150 < recall("--loop", "none")
     assert recall("--loop", "paper", "--set", "segment_map.recall=99") == 99
     file = tmp_path / "c.toml"
@@ -259,7 +257,7 @@ def test_ctrl_c_leaves_what_was_done_until_then(tmp_path, drive, monkeypatch, ca
                 raise KeyboardInterrupt
             yield view
 
-    monkeypatch.setattr("sofjax.cli.run.views", interrupted)
+    monkeypatch.setattr("sofjax.pipeline.online.views", interrupted)
     assert run(drive, "--out", tmp_path) == 130
     assert {path.name for path in tmp_path.iterdir()} == FILES
     assert len(read_trajectory(tmp_path / "trajectory.txt").stamps) == 8
@@ -276,7 +274,7 @@ def test_ctrl_c_before_the_first_image(tmp_path, drive, monkeypatch):
         raise KeyboardInterrupt
         yield
 
-    monkeypatch.setattr("sofjax.cli.run.views", interrupted)
+    monkeypatch.setattr("sofjax.pipeline.online.views", interrupted)
     assert run(drive, "--out", tmp_path) == 130
     assert {path.name for path in tmp_path.iterdir()} == FILES - {"map.png", "trajectory.txt"}
     assert report_of(tmp_path)["funnel"]["images"] == 0
@@ -392,10 +390,12 @@ def test_where_nothing_seen_holds_the_distance_it_is_said(done):
     poses = [np.array([x, 0.0, 0.0]) for x in range(21)]
     run_log = RunLog(stamps=list(drive.image_stamps[:21]), poses=poses, across=[0] * 21)
     run_log.across[:4], run_log.across[12] = [2, 1, 3, 1], 1
-    assert run_log.unheld == pytest.approx(9)
+    assert run_log.longest_without_across == pytest.approx(9)
     (said,) = results.warnings(drive, run_log)
     assert said.startswith("for 9.0 m no line across the way") and "odometer" in said
     run_log.across[7] = run_log.across[9] = run_log.across[16] = 1
-    assert run_log.unheld == pytest.approx(4) and not results.warnings(drive, run_log)
-    assert RunLog().unheld == 0
+    assert run_log.longest_without_across == pytest.approx(4) and not results.warnings(
+        drive, run_log
+    )
+    assert RunLog().longest_without_across == 0
     assert report_of(done)["longest_without_lines_across_m"] < 1.5

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sofjax.cli.errors_table import errors_table
+from sofjax.cli.summaries import errors_table
 from sofjax.evaluation import (
     MapErrors,
     RigidMotion,

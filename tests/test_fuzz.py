@@ -11,14 +11,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sofjax.cli.main import _parser
+from sofjax.cli.arguments import make_parser
+from sofjax.cli.run import settings_of
 from sofjax.io.camera_file import mount_fields, read_camera
 from sofjax.io.drive import read_drive
 from sofjax.io.errors import InputError
 from sofjax.io.map_file import read_map
 from sofjax.io.trajectory import read_trajectory
 from sofjax.io.yaml_text import parse_yaml
-from sofjax.pipeline.settings import gather
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
 ROWS = 6  # of each table
@@ -136,8 +136,8 @@ def test_a_map(folder, data):
 @given(data=spoilt(TOML))
 def test_a_settings_file(folder, data):
     (folder / "c.toml").write_bytes(data)
-    args = _parser().parse_args(["run", "drive", "--config", str(folder / "c.toml")])
-    refuses_in_a_sentence(gather, args)
+    args = make_parser().parse_args(["run", "drive", "--config", str(folder / "c.toml")])
+    refuses_in_a_sentence(settings_of, args)
 
 
 @budget(300)

@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 from test_cli import make_drive
 
-from sofjax.cli import main, stopping
-from sofjax.cli.run import views
+from sofjax.cli import main
 from sofjax.io.camera_file import read_camera, write_camera
 from sofjax.io.drive import read_drive
 from sofjax.io.errors import InputError
@@ -27,8 +26,9 @@ from sofjax.io.map_file import read_map
 from sofjax.io.settings import read_toml
 from sofjax.io.text import write_atomically
 from sofjax.io.trajectory import Trajectory, TrajectoryWriter, read_trajectory
-from sofjax.pipeline import run_folder
-from sofjax.pipeline.run_log import Closed
+from sofjax.pipeline import results_files, run_folder, stopping
+from sofjax.pipeline.online import views
+from sofjax.pipeline.stages import Closed
 
 SMALL = ("--particles", "50")
 
@@ -337,7 +337,7 @@ def interrupt_at(monkeypatch, number, image=8):
                 signal.raise_signal(number)
             yield view
 
-    monkeypatch.setattr("sofjax.cli.run.views", interrupted)
+    monkeypatch.setattr("sofjax.pipeline.online.views", interrupted)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -385,14 +385,14 @@ def test_a_run_killed_between_two_files_can_still_be_evaluated(
     """What was solved is 90 degrees off what was driven: the map fits one of the two alone."""
     solved = []
 
-    def close(drive, settings, run_log, state, driven):
+    def close(driven):
         solved.append(None)
-        turned = driven.endpoints_world[..., ::-1] * np.array([-1.0, 1.0])
-        path, turn = run_log.trajectory, np.array([[0.0, -1.0], [1.0, 0.0]])
+        turned = driven.final.endpoints_world[..., ::-1] * np.array([-1.0, 1.0])
+        path, turn = driven.log.trajectory, np.array([[0.0, -1.0], [1.0, 0.0]])
         path = Trajectory(path.stamps, path.xy @ turn.T, path.yaw + np.pi / 2)
         report = {"lines": 1, "accepted": 0, "refused": 0}
         none = np.zeros((0, 2)), np.zeros((0, 2, 2))
-        moved = eqx.tree_at(lambda final: final.endpoints_world, driven, turned)
+        moved = eqx.tree_at(lambda final: final.endpoints_world, driven.final, turned)
         return Closed(path, moved, *none, report)
 
     def killed_after(name, write):
@@ -405,9 +405,9 @@ def test_a_run_killed_between_two_files_can_still_be_evaluated(
 
     monkeypatch.setattr("sofjax.pipeline.finalize.close", close)
     for where, name in (
-        (report, "write_trajectory"),
-        (report, "write_map"),
-        (outputs, "write_json"),
+        (results_files, "write_trajectory"),
+        (results_files, "write_map"),
+        (run_folder, "write_json"),
     ):
         monkeypatch.setattr(where, name, killed_after(last, getattr(where, name)))
     with pytest.raises(Killed):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import equinox as eqx
 
-from sofjax.cli.main import _parser
+from sofjax.cli.arguments import make_parser
 from sofjax.io.camera_file import read_camera
 from sofjax.io.settings import to_dict
 from sofjax.pipeline.settings import RunSettings
@@ -44,7 +44,7 @@ def test_the_python_blocks_run_one_after_the_other():
 def test_the_commands_that_it_shows_are_understood():
     for line in "".join(blocks("sh")).splitlines():
         for command in re.findall(r"sofjax ([^;&]*)", line):
-            _parser().parse_args(shlex.split(command.replace("$seed", "1"), comments=True))
+            make_parser().parse_args(shlex.split(command.replace("$seed", "1"), comments=True))
 
 
 def test_the_camera_file_that_it_shows_is_read(tmp_path):

@@ -1,4 +1,4 @@
-"""The command line. One file a command, each with `add_parser` and `run`.
+"""The command line: parse, call `sofjax.pipeline`, print. One file a command, each with `run`.
 
 What is slow to import is imported inside `run`, so that `--help` answers at once.
 """

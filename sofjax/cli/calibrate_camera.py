@@ -2,84 +2,29 @@
 
 import argparse
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sofjax.io.errors import InputError
+from sofjax.cli.progress import bar
+from sofjax.io.errors import InputError, quoted
 
 if TYPE_CHECKING:
     from sofjax.vision.boards import Board
     from sofjax.vision.checkerboard import CameraFit, Verdict
 
-# vision.boards.PATTERNS, which would take the parser a second to import
-PATTERNS = ("chessboard", "circles", "acircles", "charuco")
+MAX_CORNERS = 60  # along a side
 REFUSED = 3  # exit code: all was read, and nothing can be known from it
 
 
-def add_parser(parts: argparse._SubParsersAction) -> None:
-    parser = parts.add_parser(
-        "camera",
-        help="focal length, centre and lens from images of a checkerboard",
-        description="Find focal length, centre and distortion from images of a checkerboard, a "
-        "grid of circles or a ChArUco board. 15 to 20 images do, near and tilted, that reach every "
-        "corner of the view. Who has a calibration of ROS, OpenCV or Kalibr for the camera needs "
-        "none: it does as camera.yaml with a mount added at its end, such as "
-        "'mount: {height: 0.6, pitch: 0.26}'.",
-    )
-    parser.add_argument(
-        "images", metavar="IMAGES", nargs="+", type=Path, help="a folder of images, or files"
-    )
-    parser.add_argument(
-        "--board",
-        metavar="9x6",
-        required=True,
-        help="inner corners along and across: a board of 10x7 squares has 9x6; with circles those "
-        "of a row and the rows, with charuco the squares",
-    )
-    parser.add_argument(
-        "--square",
-        metavar="M",
-        type=float,
-        required=True,
-        help="side of a square, metres; with circles from one to the next, with acircles from row "
-        "to row",
-    )
-    parser.add_argument(
-        "--pattern",
-        choices=PATTERNS,
-        default=PATTERNS[0],
-        help="what is on the board: circles in a square grid, or (acircles) with every other row "
-        "half a step aside; default chessboard",
-    )
-    parser.add_argument(
-        "--marker", metavar="M", type=float, help="side of a charuco board's markers, metres"
-    )
-    parser.add_argument(
-        "-o",
-        "--out",
-        metavar="FILE",
-        type=Path,
-        default=Path("camera.yaml"),
-        help="the camera file; default camera.yaml. The mount that it has already is kept, and a "
-        "figure is drawn beside it. Files that sofjax has not written are not replaced",
-    )
-    parser.add_argument(
-        "--mount",
-        metavar="height=0.6,pitch=0.26,...",
-        help="where the camera sits on the robot, as measured; metres and radians",
-    )
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
-    """Find the corners, fit, judge, draw, write."""
+    """Find the corners, fit, judge, print, write, draw."""
     from sofjax import viewer
-    from sofjax.cli import board_images
     from sofjax.io.camera_file import known_mount, mount_fields
-    from sofjax.pipeline import run_folder
+    from sofjax.pipeline import board_images, run_folder
     from sofjax.vision.checkerboard import fit_camera, judge
 
-    board = board_images.board(args)
+    board = board_of(args)
     if args.out.is_dir():
         raise InputError(f"{args.out}: is a folder; -o must name a file, such as camera.yaml")
     figure = args.out.with_suffix(".png")
@@ -87,7 +32,9 @@ def run(args: argparse.Namespace) -> int:
     run_folder.check_figure(figure)
     mount = known_mount(args.out) if args.out.exists() else {}
     mount |= mount_fields("--mount", args.mount) if args.mount is not None else {}
-    found = board_images.look(board_images.files(args.images), board)
+    files = board_images.files(args.images)
+    with bar(len(files), board.things) as progress:
+        found = board_images.look(files, board, progress)
     run_folder.check_writable(args.out.parent)
     try:
         fit = fit_camera(board, found.width, found.height, found.names, found.views)
@@ -102,23 +49,65 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{args.out} is not written")
     if viewer.available():
-        used = [view.used for view in fit.views]
-        viewer.draw_corners(
-            figure,
-            f"{sum(used)} of {len(used)} views of a {board} board used: {verdict.word}",
-            (fit.width, fit.height),
-            [view.corners for view in fit.views],
-            [view.residuals for view in fit.views],
-            used,
-            found.names,
-        )
+        _draw(figure, board, fit, verdict, found.names)
         print(f"drawn to {figure}")
     else:
         print(viewer.MISSING)
     return 0 if verdict.usable else REFUSED
 
 
-def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict) -> None:
+def board_of(args: argparse.Namespace) -> "Board":
+    """The board of --pattern, --board, --square and --marker, checked."""
+    from sofjax.pipeline.board_images import MIN_CORNERS
+    from sofjax.vision.boards import Board
+
+    sides = args.board.lower().replace("×", "x").split("x")
+    what = {"chessboard": "inner corners", "charuco": "squares"}.get(args.pattern, "circles")
+    if len(sides) != 2 or not all(re.fullmatch(" *[0-9]{1,9} *", side) for side in sides):
+        raise InputError(
+            f"--board is {quoted(args.board)}; it must be the {what} along and across, like 9x6"
+        )
+    columns, rows = map(int, sides)
+    if not (MIN_CORNERS <= min(columns, rows) and max(columns, rows) <= MAX_CORNERS):
+        raise InputError(
+            f"--board is {quoted(args.board)}; each side must have from {MIN_CORNERS} to "
+            f"{MAX_CORNERS} {what}"
+        )
+    if not 0 < args.square <= 1:  # also what is no number
+        raise InputError(
+            f"--square is {args.square:g}; it must be the side of a square in metres, such as 0.03"
+        )
+    if args.pattern != "charuco":
+        if args.marker is not None:
+            raise InputError("--marker goes with --pattern charuco alone; leave it out")
+        return Board(columns, rows, args.square, args.pattern)
+    if args.marker is None or not 0 < args.marker < args.square:
+        given = "missing" if args.marker is None else f"{args.marker:g}"
+        raise InputError(
+            f"--marker is {given}; it must be the side of a charuco board's markers in metres, "
+            "less than --square"
+        )
+    return Board(columns, rows, args.square, args.pattern, args.marker)
+
+
+def _draw(
+    path: Path, board: "Board", fit: "CameraFit", verdict: "Verdict", names: list[str]
+) -> None:
+    from sofjax import viewer
+
+    used = [view.used for view in fit.views]
+    viewer.draw_corners(
+        path,
+        f"{sum(used)} of {len(used)} views of a {board} board used: {verdict.word}",
+        (fit.width, fit.height),
+        [view.corners for view in fit.views],
+        [view.residuals for view in fit.views],
+        used,
+        names,
+    )
+
+
+def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict[str, float]) -> None:
     """The camera file, and what it still wants."""
     import jax.numpy as jnp
 

@@ -5,32 +5,17 @@ import json
 import time
 from pathlib import Path
 
+from sofjax.cli import inspect, simulate
+from sofjax.cli import run as estimate
+from sofjax.cli.arguments import make_parser
+
 PAGE, IMAGES = "index.html", "images.png"
-
-
-def add_parser(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "demo",
-        help="make a drive, run on it and show what came out",
-        description="Make a drive through a corridor like the paper's, estimate its path and its "
-        "map, and write a page that explains both. Takes about a minute.",
-    )
-    parser.add_argument("--out", metavar="DIR", type=Path, help="default: runs/demo-<time>/")
-    parser.add_argument(
-        "--world",
-        metavar="NAME",
-        default="paper",
-        help="paper, l, t, eight or random; default paper",
-    )
-    parser.add_argument("--seed", metavar="S", type=int, default=3, help="of the world; default 3")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, look, run, explain: each step is a command that can be given alone."""
     begun = time.perf_counter()
     from sofjax import viewer
-    from sofjax.cli.main import main
     from sofjax.io.text import write_atomically
     from sofjax.pipeline import run_folder
 
@@ -38,22 +23,22 @@ def run(args: argparse.Namespace) -> int:
     run_folder.check_new(folder)
     run_folder.check_writable(folder)
     drive, result = folder / "drive", folder / "run"
-    steps = {
-        "a robot is driven through a made-up corridor": [
+    steps = (
+        ("a robot is driven through a made-up corridor", simulate.run, [
             "simulate", "--world", args.world, "--seed", str(args.seed), "--out", str(drive)
-        ],
-        "lines in its camera's images: which of them are on the floor?": [
+        ]),
+        ("lines in its camera's images: which of them are on the floor?", inspect.run, [
             "inspect", str(drive), "--out", str(folder / IMAGES)
-        ],
-        "its path and a map of the floor, from images and odometry": [
+        ]),
+        ("its path and a map of the floor, from images and odometry", estimate.run, [
             "run", str(drive), "--out", str(result)
-        ],
-    }  # fmt: skip
-    for number, (what, command) in enumerate(steps.items(), start=1):
-        if command[0] == "inspect" and not viewer.available():
+        ]),
+    )  # fmt: skip
+    for number, (what, command, words) in enumerate(steps, start=1):
+        if command is inspect.run and not viewer.available():
             continue
-        print(f"\n[{number}/{len(steps)}] {what}\n$ sofjax {' '.join(command)}", flush=True)
-        code = main(command)
+        print(f"\n[{number}/{len(steps)}] {what}\n$ sofjax {' '.join(words)}", flush=True)
+        code = command(make_parser().parse_args(words))
         if code:
             return code
     report = json.loads((result / run_folder.REPORT).read_text())

@@ -1,16 +1,31 @@
 """Where arguments come in and exceptions become an exit code."""
 
-import argparse
 import os
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
-from typing import NoReturn
 
-from sofjax.cli import calibrate, demo, evaluate, inspect, run, simulate, stopping
+from sofjax.cli import (
+    calibrate_camera,
+    calibrate_mount,
+    demo,
+    evaluate,
+    inspect,
+    run,
+    simulate,
+)
+from sofjax.cli.arguments import make_parser
 from sofjax.io.errors import InputError, quoted
+from sofjax.pipeline import stopping
 
-QUOTED = 200  # characters of the message of a word that is no option
+COMMANDS = {
+    "run": run.run,
+    "evaluate": evaluate.run,
+    "inspect": inspect.run,
+    "calibrate camera": calibrate_camera.run,
+    "calibrate mount": calibrate_mount.run,
+    "simulate": simulate.run,
+    "demo": demo.run,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -22,9 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     with stopping.listening():
         try:
-            args = _parser().parse_args(argv)
+            args = make_parser().parse_args(argv)
             _keep_compilations()
-            return args.run(args)
+            return COMMANDS[args.command](args)
         except SystemExit as end:  # argparse has printed its own
             return end.code if isinstance(end.code, int) else 0
         except InputError as error:
@@ -57,21 +72,3 @@ def _keep_compilations() -> None:
 
     jax.config.update("jax_compilation_cache_dir", os.path.abspath(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many are small
-
-
-class _Parser(argparse.ArgumentParser):
-    """One that quotes little of what it was given."""
-
-    def error(self, message: str) -> NoReturn:
-        super().error(message if len(message) <= QUOTED else f"{message[:QUOTED]}...")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="sofjax", description="Segments-on-floor SLAM: a drive in, a trajectory and a map out."
-    )
-    parser.add_argument("--version", action="version", version=f"sofjax {version('sofjax')}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (run, evaluate, inspect, calibrate, simulate, demo):
-        command.add_parser(commands)
-    return parser

@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 import re
-from pathlib import Path
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from sofjax.io.errors import InputError, nearest, quoted
@@ -13,71 +13,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from sofjax.simulation import Imaging, Rig
-
-WORLD_HELP = "paper, l, t, eight or random; default paper"
-
-
-def add_parser(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "simulate",
-        help="make a drive through a corridor, with exact truth",
-        description="Make a drive: a robot is driven by hand through a corridor, and its camera's "
-        "images, its odometry and the truth are written as a drive's folder.",
-    )
-    parser.add_argument("--out", metavar="DRIVE", type=Path, required=True, help="a new folder")
-    parser.add_argument("--world", metavar="NAME", default="paper", help=WORLD_HELP)
-    parser.add_argument(
-        "--seed", metavar="S", type=int, default=0, help="of the look, the drive and the "
-        "noise; in the world 'random' also of the plan, the camera and the odometer"
-    )  # fmt: skip
-    parser.add_argument(
-        "--way",
-        metavar="'x,y x,y ...'",
-        help="points to drive along instead of the world's own, metres",
-    )
-    parser.add_argument("--images", metavar="N", type=int, help="stop after so many")
-    mount = parser.add_argument_group("the camera on the robot")
-    for name, unit, what in (
-        ("height", "M", "metres above the floor; default 1"),
-        ("pitch", "DEG", "degrees that it looks down; default 12"),
-        ("roll", "DEG", "degrees; default 0"),
-        ("yaw", "DEG", "degrees to the left; default 0"),
-        ("x", "M", "metres before the axle; default 0.1"),
-        ("y", "M", "metres left of the middle; default 0"),
-    ):
-        mount.add_argument(f"--{name}", metavar=unit, type=float, help=what)
-    camera = parser.add_argument_group("the camera")
-    camera.add_argument("--size", metavar="WxH", help="pixels; default 320x240")
-    camera.add_argument("--focal", metavar="PX", type=float, help="pixels; default 291 at 320x240")
-    camera.add_argument(
-        "--distortion",
-        metavar="k",
-        nargs="+",
-        type=float,
-        help="k1 k2 p1 p2 k3 as OpenCV's plumb_bob",
-    )
-    camera.add_argument("--noise", metavar="GREY", type=float, help="grey values; default 2.5")
-    camera.add_argument(
-        "--blur", metavar="PX", type=float, help="of the lens, pixels; default 0.55"
-    )
-    robot = parser.add_argument_group("the robot")
-    robot.add_argument("--speed", metavar="M/S", type=float, help="metres a second; default 0.7")
-    robot.add_argument("--wobble", metavar="RAD/S", type=float, help="of the hand; default 0.05")
-    robot.add_argument("--vibration", metavar="DEG", type=float, help="of the mount; default 0.1")
-    robot.add_argument(
-        "--dropped", metavar="SHARE", type=float, help="of the readings; default 0.01"
-    )
-    robot.add_argument(
-        "--odometer",
-        metavar="name=value",
-        nargs="+",
-        action="extend",
-        default=[],
-        help="errors of the odometer: distance, left and right (read / true), bend (rad/m), "
-        "distance_noise (m/sqrt(m)), heading_noise (rad/sqrt(m)), turn_noise (rad/sqrt(rad)), "
-        "slip (a metre)",
-    )
-    parser.set_defaults(run=run, parser=parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -97,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     imaging.check()
     ride = take_ride(world, rig, args.seed, args.images)
 
-    def progress(frames: list) -> tqdm:
+    def progress(frames: Iterable) -> Iterable:
         return tqdm(frames, desc=args.out.name, unit=" images", disable=None)
 
     record(args.out, world, rig, ride, imaging, args.seed, progress)
@@ -141,7 +76,7 @@ def choose_rig(args: argparse.Namespace) -> "Rig":
         "vibration": None if args.vibration is None else np.radians(args.vibration),
         "dropped": args.dropped,
     }
-    driven = {"speed": args.speed, "wobble": args.jitter}
+    driven = {"speed": args.speed, "jitter": args.jitter}
     return dataclasses.replace(
         rig,
         camera_file=webcam(mount, focal, width, height, distortion),

@@ -1,7 +1,7 @@
 """Settings as names with dots: from TOML and the command line into frozen dataclasses, and back.
 
 A setting is a leaf of a tree of dataclasses, `motion.distance_noise`; its default tells its type.
-A field with `INLINE` as its metadata lends its own fields to the level above.
+The settings of a field with `INLINE` as its metadata are named as if they were of the level above.
 """
 
 import dataclasses
@@ -10,13 +10,13 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from sofjax.io.errors import InputError, nearest, plain, quoted
 from sofjax.io.numbers import decimal, whole
 from sofjax.io.text import SETTINGS_BYTES, read_text
 
-Config = TypeVar("Config")
+Config = TypeVar("Config")  # a frozen dataclass
 Setting = bool | int | float | str
 
 INLINE = {"inline": True}
@@ -28,12 +28,18 @@ def to_dict(config: Any) -> dict[str, Setting]:
     return dict(_leaves(config, ""))
 
 
-def with_settings(config: Config, given: Mapping[str, object], where: str) -> Config:
+def with_settings(
+    config: Config,
+    given: Mapping[str, object],
+    where: str,
+    check: Callable[[str, Setting], None] | None = None,
+) -> Config:
     """The same settings with some of them changed.
 
     **Arguments:**
     - `given`: values by name, of the setting's type, or as text from the command line.
     - `where`: the file or option, for the sentence of an `InputError`.
+    - `check`: raises `ValueError` for a name's value that cannot be used.
     """
     known = to_dict(config)
     values = {}
@@ -42,6 +48,9 @@ def with_settings(config: Config, given: Mapping[str, object], where: str) -> Co
             raise InputError(f"{where}: there is no setting {quoted(name)}; {nearest(name, known)}")
         values[name] = _cast(f"{where}: '{name}'", value, known[name])
     try:
+        for name, value in values.items():
+            if check is not None:
+                check(name, value)
         return _replace(config, values, "")
     except InputError:
         raise
@@ -86,13 +95,13 @@ def _leaves(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
 
 def _replace(config: Config, values: Mapping[str, Setting], prefix: str) -> Config:
     changed = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if dataclasses.is_dataclass(value):
+    for field in dataclasses.fields(cast(Any, config)):
+        value: Any = getattr(config, field.name)
+        if dataclasses.is_dataclass(type(value)):
             changed[field.name] = _replace(value, values, _below(field, prefix))
         else:
             changed[field.name] = values.get(prefix + field.name, value)
-    return dataclasses.replace(config, **changed)
+    return dataclasses.replace(cast(Any, config), **changed)
 
 
 def _below(field: dataclasses.Field, prefix: str) -> str:
@@ -109,24 +118,25 @@ def _flatten(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, ob
 
 def _cast(where: str, value: object, like: Setting) -> Setting:
     """A value as the type of the setting's present one; bool before int, which it also is."""
-    text = isinstance(value, str)
     if isinstance(like, bool):
-        value = {"true": True, "false": False}.get(value.lower(), value) if text else value
+        if isinstance(value, str):
+            value = {"true": True, "false": False}.get(value.lower(), value)
         if isinstance(value, bool):
             return value
         right = "true or false"
     elif isinstance(like, int):
-        number = _parsed(whole, value) if text else value
-        if type(number) is int:
+        number = _parsed(whole, value) if isinstance(value, str) else value
+        if isinstance(number, int) and not isinstance(number, bool):
             return number
         right = "a whole number"
     elif isinstance(like, float):
-        number = _parsed(decimal, value) if text else value
-        if type(number) in (int, float) and abs(number) <= sys.float_info.max:
-            return float(number)
+        number = _parsed(decimal, value) if isinstance(value, str) else value
+        if isinstance(number, int | float) and not isinstance(number, bool):
+            if abs(number) <= sys.float_info.max:
+                return float(number)
         right = "a finite number"
     else:
-        if text:
+        if isinstance(value, str):
             return value
         right = "text"
     raise InputError(f"{where} is {quoted(value)}; it must be {right}")

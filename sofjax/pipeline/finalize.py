@@ -1,4 +1,4 @@
-"""After the drive: the path and the map once more, with all that was seen in the end."""
+"""After the drive: the path and the map solved for once more, from all images together."""
 
 import ctypes
 import gc
@@ -12,36 +12,31 @@ import numpy as np
 
 from sofjax import loop_closure, smoothing
 from sofjax.evaluation import align
-from sofjax.io.drive import Drive
+from sofjax.extraction.observation import Observation
 from sofjax.io.trajectory import Trajectory
-from sofjax.pipeline.run_log import Closed, RunLog
-from sofjax.pipeline.settings import RunSettings
-from sofjax.segment_map import FinalMap
-from sofjax.slam.state import SlamState
+from sofjax.motion import BIAS
+from sofjax.pipeline.run_log import RunLog
+from sofjax.pipeline.stages import Closed, Driven
 
 # where a user says that the drive ends as a loop: the share of lines that must fit, and the lead
-TOLD = loop_closure.ClosingConfig(share=0.4, margin=6.0)
+AT_THE_END = loop_closure.ClosingConfig(share=0.4, margin=6.0)
 SPREAD = 0.5  # metres about its middle that a path needs to show a direction
+FOUND = "one place fits, and no other near it"
 
 
-def close(
-    drive: Drive, settings: RunSettings, run_log: RunLog, state: SlamState, driven: FinalMap
-) -> Closed | None:
-    """By `settings.loop`; None if there is nothing to be found.
-
-    **Arguments:**
-    - `driven`: the map as the drive left it.
-    """
+def close(driven: Driven) -> Closed | None:
+    """The drive closed as `settings.loop` says; None if nothing can be solved for."""
+    run_log = driven.log
     if len(run_log.stamps) < 2:
         return None
-    log = jax.tree.map(lambda *leaves: np.stack(leaves), *run_log.observations)
+    observations = jax.tree.map(lambda *leaves: np.stack(leaves), *run_log.observations)
     path = smoothing.Path(
-        run_log.T_world_robot, jnp.asarray(np.stack(run_log.tilt)), jnp.asarray(run_log.bias)
+        run_log.T_world_robot, jnp.asarray(np.stack(run_log.jitter)), jnp.asarray(run_log.bias)
     )
-    _make_room()
-    way = {"paper": _by_the_paper, "smooth": _smooth}[settings.loop]
+    _free_memory()
+    solve = {"paper": _by_the_paper, "smooth": _smooth}[driven.settings.loop]
     begun = time.perf_counter()
-    closed = way(drive, settings, run_log, log, path, state, driven)
+    closed = solve(driven, observations, path)
     if closed is None or not np.isfinite(closed.trajectory.xy).all():
         return None
     closed = _in_the_frame_of(np.array(run_log.poses, float)[:, :2], closed)
@@ -49,8 +44,8 @@ def close(
     return closed
 
 
-def _make_room() -> None:
-    """What the drive was compiled with goes: else compiling the solution tops it by a third."""
+def _free_memory() -> None:
+    """Drop the programs of the drive: with them, compiling the solution needs a third more."""
     jax.clear_caches()
     gc.collect()
     if sys.platform == "linux":  # freed, but kept by the C library
@@ -58,9 +53,9 @@ def _make_room() -> None:
 
 
 def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
-    """Moved so that its path [T, 2] lies nearest to the one known while driving.
+    """The solution moved so that its path lies nearest to the one known while driving, [T, 2].
 
-    No image says where the world's axes are; so the map serves both paths.
+    No image observes the world's axes, so they may be chosen; the map then fits both paths.
     """
     if np.sqrt(driven.var(axis=0).sum()) < SPREAD:
         return closed
@@ -69,7 +64,9 @@ def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
     return Closed(
         Trajectory(path.stamps, motion.apply(path.xy), path.yaw + motion.yaw),
         eqx.tree_at(
-            lambda f: f.endpoints_world, closed.final, motion.apply(closed.final.endpoints_world)
+            lambda f: f.endpoints_world,
+            closed.final,
+            motion.apply(np.asarray(closed.final.endpoints_world)),
         ),
         motion.apply(closed.places),
         motion.R @ closed.covariances @ motion.R.T,
@@ -77,28 +74,28 @@ def _in_the_frame_of(driven: np.ndarray, closed: Closed) -> Closed:
     )
 
 
-def _smooth(drive, settings, run_log, log, path, state, _) -> Closed:
-    """All poses and lines at once, and again with each loop that was found."""
-    file = drive.camera_file
+def _smooth(driven: Driven, observations: Observation, path: smoothing.Path) -> Closed:
+    """All poses and lines solved for at once, and again with each loop that was found."""
+    assert driven.state is not None
+    run_log, file = driven.log, driven.drive.camera_file
     closed = loop_closure.close(
-        settings.slam, file.camera, file.mount, log, path, state.segment_map
-    )
+        driven.settings.slam, file.camera, file.mount, observations, path,
+        driven.state.segment_map,
+    )  # fmt: skip
     done, final, asked = closed.smoothed, closed.final, closed.asked
     solution, T, n = done.solution, done.T_world_robot, len(done.index)
-    bias = zip(
-        ("distance", "left", "right", "curvature"), solution.unknowns.shared[4:], strict=True
-    )
+    bias = zip(BIAS, solution.unknowns.shared[4:], strict=True)
     end = np.sqrt(np.diag(solution.pose_covariance[n - 1])[:3])
     return Closed(
         Trajectory(np.array(run_log.stamps), np.asarray(T.xy), np.unwrap(T.yaw)),
         final,
-        solution.unknowns.pose[:n, :2],
-        solution.pose_covariance[:n, :2, :2],
+        np.asarray(solution.unknowns.pose)[:n, :2],
+        np.asarray(solution.pose_covariance)[:n, :2, :2],
         _revisits_report(asked, run_log)
         | {
             "keyframes": n,
             "lines": int(done.lines.valid.sum()),
-            "off_floor": int((done.lines.valid & done.lines.off_floor).sum()),
+            "raised": int((done.lines.valid & done.lines.off_floor).sum()),
             "merged": done.merged,
             "segments": int(done.problem.keyframes.known.sum()),
             "cost": [{"before": before, "after": after} for before, after in done.costs],
@@ -110,12 +107,14 @@ def _smooth(drive, settings, run_log, log, path, state, _) -> Closed:
     )
 
 
-def _by_the_paper(drive, _settings, run_log, _log, path, state, final) -> Closed:
-    """The error at the end, spread evenly back along the path; as it was if no loop is found."""
-    mount = drive.camera_file.mount
-    known = loop_closure.driven(path, mount, state.segment_map, final)
+def _by_the_paper(driven: Driven, _: Observation, path: smoothing.Path) -> Closed:
+    """The error at the end, distributed evenly along the path; as it was if no loop is found."""
+    assert driven.state is not None and driven.final is not None
+    run_log, mount, final = driven.log, driven.drive.camera_file.mount, driven.final
+    segment_map = driven.state.segment_map
+    known = loop_closure.driven(path, mount, segment_map, final)
     last = np.array([len(run_log.stamps) - 1])
-    asked = loop_closure.revisits(TOLD, known, last)
+    asked = loop_closure.revisits(AT_THE_END, known, last)
     T, endpoints = path.T_world_robot, final.endpoints_world
     for revisit in asked:
         if revisit.closing.accepted:
@@ -128,19 +127,19 @@ def _by_the_paper(drive, _settings, run_log, _log, path, state, final) -> Closed
         eqx.tree_at(lambda f: f.endpoints_world, final, endpoints),
         np.zeros((0, 2)),
         np.zeros((0, 2, 2)),
-        _revisits_report(asked, run_log) | {"lines": int(state.segment_map.valid.sum())},
+        _revisits_report(asked, run_log) | {"lines": int(segment_map.valid.sum())},
     )
 
 
 def _revisits_report(asked: list[loop_closure.Revisit], run_log: RunLog) -> dict[str, object]:
-    """Every place that was asked for, and why a loop was closed there or refused."""
+    """Every place that was looked for, and why a loop was closed there or refused."""
     rows = []
     for revisit in asked:
         c = revisit.closing
         here = jnp.asarray(run_log.poses[revisit.image][:2], float)
         shift = np.hypot(*(c.T_correction.apply(here) - here))
         row = {"at": run_log.stamps[revisit.image], "since": run_log.stamps[revisit.since]}
-        row |= {"accepted": c.accepted, "why": c.reason or "one place fits, and no other near it"}
+        row |= {"accepted": c.accepted, "why": c.reason or FOUND}
         row |= {"lines": c.lines, "matched": c.matched, "lead": c.lead}
         rows.append(row | ({"shift_m": float(shift)} if c.accepted else {}))
     accepted = sum(row["accepted"] for row in rows)

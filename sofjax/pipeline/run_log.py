@@ -13,9 +13,7 @@ from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory
 from sofjax.motion import BIAS
-from sofjax.segment_map import FinalMap
-from sofjax.slam.state import StepInfo
-from sofjax.vision import View
+from sofjax.pipeline.online import Frame
 
 WARM = 10  # images that timing leaves out: the first one compiles
 OF_THE_STEP = (
@@ -37,11 +35,11 @@ class RunLog:
     stamps: list[float] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)  # (x, y, yaw), metres, radians
     observations: list[Observation] = field(default_factory=list)  # on the host
-    tilt: list[np.ndarray] = field(default_factory=list)  # (pitch, roll), radians
-    across: list[int] = field(default_factory=list)  # matched lines that run across the way
+    jitter: list[np.ndarray] = field(default_factory=list)  # (pitch, roll), radians
+    across: list[int] = field(default_factory=list)  # matched lines across the heading
     bias: np.ndarray | None = None  # the odometer's errors at last
     faults: dict[str, list[str]] = field(default_factory=dict)  # files that tell nothing, by why
-    blind: int = 0  # images that were read and had no segment
+    without_segments: int = 0  # images that were read and had no segment
     detected: int = 0  # segments
     overflow: int = 0  # segments that found no place in an observation
     step: dict[str, int] = field(default_factory=lambda: dict.fromkeys(OF_THE_STEP, 0))
@@ -49,16 +47,15 @@ class RunLog:
     seconds: list[dict[str, float]] = field(default_factory=list)  # of each stage, per image
     done: list[float] = field(default_factory=list)  # clock at the end of each image
 
-    def add(
-        self,
-        drive: Drive,
-        view: View,
-        observed: Observation,
-        info: StepInfo,
-        seconds: dict[str, float],
-        now: float,
-    ) -> None:
-        """The next image: what the front end saw, what the step said, and how long each took."""
+    def add(self, drive: Drive, frame: Frame, now: float) -> None:
+        """Count the next image of a drive.
+
+        **Arguments:**
+        - `now`: the clock at its end, seconds.
+
+        **Raises:** `InputError` if the estimate is not finite.
+        """
+        view, info = frame.view, frame.info
         i = len(self.stamps)
         pose = np.append(info.T_world_robot.xy, info.T_world_robot.yaw).astype(float)
         if not np.isfinite(pose).all():
@@ -68,19 +65,19 @@ class RunLog:
             )
         self.stamps.append(float(drive.image_stamps[i]))
         self.poses.append(pose)
-        self.observations.append(jax.device_get(observed))
-        self.tilt.append(info.jitter)
+        self.observations.append(jax.device_get(frame.observation))
+        self.jitter.append(np.asarray(info.jitter))
         self.across.append(int(info.across))
-        self.bias = info.bias
+        self.bias = np.asarray(info.bias)
         if view.fault:
             file = str(drive.image_files[i].relative_to(drive.path))
             self.faults.setdefault(view.fault, []).append(file)
-        self.blind += view.readable and view.detected == 0
+        self.without_segments += view.readable and view.detected == 0
         self.detected += view.detected
         self.overflow += view.overflow
         for name in OF_THE_STEP:
             self.step[name] += int(getattr(info, name))
-        self.seconds.append(view.seconds | seconds)
+        self.seconds.append(view.seconds | frame.seconds)
         self.done.append(now)
 
     @property
@@ -91,10 +88,11 @@ class RunLog:
     @property
     def odometer(self) -> dict[str, float]:
         """The odometer's errors as they were learned at last, by name."""
-        return dict(zip(BIAS, map(float, self.bias), strict=True)) if self.done else {}
+        return {} if self.bias is None else dict(zip(BIAS, map(float, self.bias), strict=True))
 
     @property
     def trajectory(self) -> Trajectory:
+        """The estimates while driving."""
         poses = np.reshape(self.poses, (-1, 3))
         return Trajectory(np.array(self.stamps), poses[:, :2], np.unwrap(poses[:, 2]))
 
@@ -105,11 +103,11 @@ class RunLog:
         return SE2(jnp.asarray(poses[:, :2]), jnp.asarray(poses[:, 2]))
 
     @property
-    def unheld(self) -> float:
-        """The longest way driven without a known line across it, metres."""
+    def longest_without_across(self) -> float:
+        """The longest path driven without a matched line across the heading, metres."""
         travelled = self.trajectory.travelled
-        held = np.flatnonzero(self.across)
-        ends = travelled[[0, *held, -1]] if len(travelled) else np.zeros(2)
+        seen = np.flatnonzero(self.across)
+        ends = travelled[[0, *seen, -1]] if len(travelled) else np.zeros(2)
         return float(np.diff(ends).max())
 
     @property
@@ -123,14 +121,3 @@ class RunLog:
         seconds = self.seconds[WARM:] or self.seconds
         stages = seconds[0] if seconds else {}
         return {stage: 1e3 * float(np.mean([s[stage] for s in seconds])) for stage in stages}
-
-
-@dataclass
-class Closed:
-    """What was found after the drive."""
-
-    trajectory: Trajectory
-    final: FinalMap
-    places: np.ndarray  # [n, 2], where the path's uncertainty is known, metres
-    covariances: np.ndarray  # [n, 2, 2], square metres
-    report: dict[str, object]

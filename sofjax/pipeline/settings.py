@@ -1,25 +1,22 @@
-"""From the options of the command line to the settings of a run."""
+"""The settings of a run: presets, files and options, and what no run can use."""
 
-import argparse
 import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from sofjax.cli.run import LOOPS
 from sofjax.io.errors import InputError, nearest, quoted
-from sofjax.io.settings import INLINE, read_toml, to_dict, with_settings
+from sofjax.io.settings import INLINE, Setting, read_toml, to_dict, with_settings
+from sofjax.pipeline.outcomes import LOOPS
 from sofjax.segment_map import MapConfig
 from sofjax.slam import presets
 from sofjax.slam.config import SlamConfig
 from sofjax.vision import DETECTORS, FrontendSettings
 
-FRONTENDS = {"paper": FrontendSettings(detector="hough")}  # of a preset; the default otherwise
-
-CLOSINGS = {"paper": "none"}  # likewise; the paper closes by hand, where it knows of a loop
-
+FRONTEND = FrontendSettings()
 RECALL = 150  # images: the paper's closing is of a filter that does not find its start by itself
 
 CHOICES = {
     "loop": LOOPS,
-    "frontend.detector": tuple(DETECTORS),
     "filter.choice": ("resample", "winner"),
     "segment_map.rule": ("kalman", "gamma"),
 }
@@ -37,57 +34,103 @@ LIMITS = {
 
 @dataclasses.dataclass(frozen=True)
 class RunSettings:
-    """All that decides what a run writes, beside the drive."""
+    """All that decides what a run writes, beside the drive. Refuses what no run can use."""
 
-    seed: int
-    frontend: FrontendSettings
-    slam: SlamConfig = dataclasses.field(metadata=INLINE)
+    seed: int = 0
+    frontend: FrontendSettings = FRONTEND
+    slam: SlamConfig = dataclasses.field(default=presets.DEFAULT, metadata=INLINE)
     loop: str = "smooth"  # after the drive: "none", the "paper"'s closing, or "smooth"
 
+    def __post_init__(self) -> None:
+        for name, value in to_dict(self).items():
+            check(name, value)
 
-def gather(args: argparse.Namespace) -> RunSettings:
-    """The default, changed by the file, by `--set`, and by the options of their own, in this order.
+    @property
+    def used(self) -> "RunSettings":
+        """The settings as a run uses them: with what the choice of `loop` implies.
 
-    In the file as in `--set`, a `preset` comes first, wherever it stands. The paper's closing
-    brings its own `segment_map.recall`, unless one was given.
+        The paper's closing needs `segment_map.recall` to be `RECALL`. A recall other than the
+        default was chosen by the user and stays. What is implied is never written to
+        `config.toml`: there another `loop` would keep it.
+        """
+        if self.loop != "paper" or self.slam.segment_map.recall != MapConfig().recall:
+            return self
+        return with_settings(self, {"segment_map.recall": RECALL}, "loop")
+
+
+def check(name: str, value: Setting) -> None:
+    """Refuse a setting that no run can use, before anything is compiled for it.
+
+    **Raises:** `ValueError` with what would be right.
     """
-    settings = _preset("default", "")
-    if args.config is not None:
-        settings = _changed(settings, read_toml(args.config), str(args.config))
-    settings = _changed(settings, _pairs(args.sets), "--set")
-    named = {
-        "--particles": ("filter.particles", getattr(args, "particles", None)),
-        "--seed": ("seed", getattr(args, "seed", None)),
-        "--loop": ("loop", getattr(args, "loop", None)),
-        "--detector": ("frontend.detector", getattr(args, "detector", None)),
-    }
-    for option, (name, value) in named.items():
+    right = _what_is_right(name, value)
+    if right:
+        raise ValueError(f"'{name}' is {quoted(value)}; it must {right}")
+
+
+def _what_is_right(name: str, value: Setting) -> str:
+    """What a setting must be; empty if it is."""
+    choices = tuple(DETECTORS) if name == "frontend.detector" else CHOICES.get(name)
+    if choices is not None:
+        return "" if value in choices else f"be {' or '.join(choices)}"
+    assert not isinstance(value, str), name
+    if value < 0:
+        return "not be negative"
+    low, high = LIMITS.get(name, (value, value))
+    return "" if low <= value <= high else f"be from {low} to {high}"
+
+
+PRESETS = {name: RunSettings(slam=slam) for name, slam in presets.PRESETS.items()} | {
+    # the paper closes by hand, where it knows of a loop
+    "paper": RunSettings(
+        frontend=FrontendSettings(detector="hough"), slam=presets.PAPER, loop="none"
+    )
+}
+
+
+def gather(
+    config: Path | None = None,
+    sets: Sequence[str] = (),
+    options: Mapping[str, tuple[str, object]] | None = None,
+) -> RunSettings:
+    """The default, changed by a file, by pairs, and by options, in this order.
+
+    In the file as in the pairs, a `preset` comes first, wherever it stands.
+
+    **Arguments:**
+    - `config`: a TOML file.
+    - `sets`: pairs `name=value`.
+    - `options`: by the option's name, which errors quote, the setting's name and its value; an
+      option whose value is None changes nothing.
+
+    **Raises:** `InputError` with the file or option and what would be right.
+    """
+    settings = PRESETS["default"]
+    if config is not None:
+        settings = _changed(settings, read_toml(config), str(config))
+    settings = _changed(settings, _pairs(sets), "--set")
+    for option, (name, value) in (options or {}).items():
         if value is not None:
             settings = _changed(settings, {name: value}, option)
-    untouched = settings.slam.segment_map.recall == MapConfig().recall
-    if settings.loop == "paper" and untouched:
-        settings = with_settings(settings, {"segment_map.recall": RECALL}, "--loop")
     return settings
 
 
-def _changed(settings: RunSettings, given: dict[str, object], where: str) -> RunSettings:
+def _changed(settings: RunSettings, given: Mapping[str, object], where: str) -> RunSettings:
     given = dict(given)
     if "preset" in given:
-        settings = dataclasses.replace(_preset(given.pop("preset"), where), seed=settings.seed)
-    settings = with_settings(settings, given, where)
-    check(settings, where)
-    return settings
+        preset = _preset(given.pop("preset"), where)
+        settings = dataclasses.replace(preset, seed=settings.seed)
+    return with_settings(settings, given, where, check)
 
 
 def _preset(name: object, where: str) -> RunSettings:
-    if not isinstance(name, str) or name not in presets.PRESETS:
-        hint = nearest(name if isinstance(name, str) else "", presets.PRESETS)
+    if not isinstance(name, str) or name not in PRESETS:
+        hint = nearest(name if isinstance(name, str) else "", PRESETS)
         raise InputError(f"{where}: there is no preset {quoted(name)}; {hint}")
-    frontend = FRONTENDS.get(name, FrontendSettings())
-    return RunSettings(0, frontend, presets.PRESETS[name], CLOSINGS.get(name, "smooth"))
+    return PRESETS[name]
 
 
-def _pairs(sets: list[str]) -> dict[str, object]:
+def _pairs(sets: Sequence[str]) -> dict[str, object]:
     given = {}
     for pair in sets:
         name, equals, value = pair.partition("=")
@@ -95,19 +138,3 @@ def _pairs(sets: list[str]) -> dict[str, object]:
             raise InputError(f"--set: {quoted(pair)} must have the form name=value")
         given[name.strip()] = value.strip()
     return given
-
-
-def check(settings: RunSettings, where: str) -> None:
-    """Refuse what no run can use, before anything is compiled for it."""
-    for name, value in to_dict(settings).items():
-        if name in CHOICES:
-            if value not in CHOICES[name]:
-                right = " or ".join(CHOICES[name])
-                raise InputError(f"{where}: '{name}' is {quoted(value)}; it must be {right}")
-        elif value < 0:
-            raise InputError(f"{where}: '{name}' is {quoted(value)}; it must not be negative")
-        elif name in LIMITS and not LIMITS[name][0] <= value <= LIMITS[name][1]:
-            low, high = LIMITS[name]
-            raise InputError(
-                f"{where}: '{name}' is {quoted(value)}; it must be from {low} to {high}"
-            )

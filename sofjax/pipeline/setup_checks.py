@@ -124,7 +124,7 @@ def odometer(learned: Mapping[str, float], model: MotionModel) -> list[str]:
     - `model`: with the prior; what has a standard deviation of zero there was not learned.
     """
     priors = np.sqrt(np.diag(prior_bias(model).covariance)).tolist()
-    prior_sigma = dict(zip(BIAS, priors, strict=True))
+    prior_sigma: dict[str, float] = dict(zip(BIAS, priors, strict=True))
     found = []
     for name, value in learned.items():
         sigma = prior_sigma[name]

@@ -21,9 +21,21 @@ REPEATED = "repeat the image before while the robot moves"
 
 @dataclass(frozen=True)
 class FrontendSettings:
-    detector: str = "lsd"  # 'lsd', or 'hough' as in the paper
+    """How an image becomes segments. Refuses a detector that `DETECTORS` does not name."""
+
+    detector: str = "lsd"  # a name of `DETECTORS`: 'lsd', or 'hough' as in the paper
     capacity: int = 64  # M, segments of an image that are kept
     min_length: float = 12.0  # pixels, below which a segment tells little of a direction
+
+    def __post_init__(self) -> None:
+        if self.detector not in DETECTORS:
+            raise ValueError(
+                f"there is no detector {self.detector!r}; it must be {' or '.join(DETECTORS)}"
+            )
+        if self.capacity < 1:
+            raise ValueError(f"capacity is {self.capacity}; it must be 1 or more")
+        if not self.min_length >= 0:
+            raise ValueError(f"min_length is {self.min_length}; it must not be negative")
 
 
 @dataclass(frozen=True)
@@ -33,9 +45,7 @@ class View:
     segments_image: Segments  # capacity M, pixels of the undistorted image
     overflow: int  # segments that found no place
     detected: int  # segments before packing
-    fault: (
-        str  # why it tells nothing: no image, of another size, or the last one again; "" if it does
-    )
+    fault: str  # why it tells nothing: unreadable, of another size, a repetition; "" if it does
     seconds: dict[str, float]  # of each stage
 
     @property
@@ -52,7 +62,7 @@ class Frontend:
         settings: FrontendSettings | None = None,
         detector: Detector | None = None,
         bits: int | None = None,
-    ):
+    ) -> None:
         """**Arguments:**
         - `detector`: one's own, in the place of the one that the settings name.
         - `bits`: of images of 16 bits, as of `read_image`.
@@ -97,7 +107,7 @@ class Frontend:
         image = read_image(path, self.bits)
         clock.append(time.perf_counter())
         fault = self._fault(image)
-        if not fault:
+        if image is not None and not fault:
             image = self.undistort(image)
             clock.append(time.perf_counter())
             segments = self.detect(image)
@@ -108,7 +118,7 @@ class Frontend:
         packed, overflow = pack(segments, self.settings.capacity, worth)
         clock.append(time.perf_counter())
         stages = ("decode", "undistort", "detect")
-        seconds = dict(zip(stages, np.diff(clock).tolist(), strict=True))
+        seconds: dict[str, float] = dict(zip(stages, np.diff(clock).tolist(), strict=True))
         return View(packed, overflow, len(segments), fault, seconds)
 
     def _fault(self, image: np.ndarray | None) -> str:

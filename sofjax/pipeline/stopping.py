@@ -22,7 +22,7 @@ SECOND = 0.5  # seconds after the first; what comes sooner was sent along with i
 class _Listener:
     """The handler of the signals, and what is known of them."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.code = 128 + signal.SIGINT  # exit code
         self.first: float | None = None  # clock at the first signal
         self.pending = False  # a signal has come and has not stopped anything yet

@@ -1,19 +1,20 @@
-"""The images that `sofjax calibrate camera` is given, searched for the board."""
+"""The images of a board, from which a camera is calibrated: found, read and searched for it."""
 
-import argparse
 import dataclasses
-import re
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from sofjax.io.errors import InputError, quoted
+import numpy as np
 
-if TYPE_CHECKING:
-    from sofjax.vision.boards import Board, Correspondences
+from sofjax.io.errors import InputError
+from sofjax.pipeline.progress import Progress, watched
+from sofjax.vision import read_image
+from sofjax.vision.boards import Board, Correspondences, find_points, recognise
+from sofjax.vision.checkerboard import MIN_VIEWS
 
 SUFFIXES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
-MIN_CORNERS, MAX_CORNERS = 3, 60  # along a side
+MIN_CORNERS = 3  # along a side
+HINTED = 4  # images in which other boards are looked for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,32 +24,29 @@ class Found:
     width: int  # pixels
     height: int
     names: list[str]  # images in which the board was found
-    views: list["Correspondences"]  # of each
-    board: "Board"  # as it was recognised
+    views: list[Correspondences]  # of each
+    board: Board  # as it was recognised
     left_out: dict[str, str]  # the other images, and why
 
 
-def look(files: list[Path], board: "Board") -> Found:
-    """Search every image for the board, one at a time; those of another size than most go."""
-    from tqdm import tqdm
+def look(files: list[Path], board: Board, progress: Progress | None = None) -> Found:
+    """Search every image for the board, one at a time; those of another size than most go.
 
-    from sofjax.vision import read_image
-    from sofjax.vision.boards import find_points, recognise
-    from sofjax.vision.checkerboard import MIN_VIEWS
-
+    **Raises:** `InputError` if it is found in too few.
+    """
     shapes = {file: image.shape for file in files if (image := read_image(file)) is not None}
     if not shapes:
         raise InputError(f"{files[0].parent}: none of the {len(files)} images can be read")
     shape = _most(shapes)
     right = [file for file in files if shapes.get(file) == shape]
-    board = recognise(board, map(read_image, right))
+    board = recognise(board, map(_read, right))
     names, views, left_out = [], [], {}
-    for file in tqdm(files, desc=board.things, unit=" images", disable=None):
+    for file in watched(files, progress):
         if file not in shapes:
             left_out[file.name] = "cannot be read as an image"
         elif shapes[file] != shape:
             left_out[file.name] = f"has {_by(shapes[file])} pixels and most have {_by(shape)}"
-        elif (found := find_points(read_image(file), board)) is None:
+        elif (found := find_points(_read(file), board)) is None:
             left_out[file.name] = (
                 f"no {board} {board.things} found: is the whole board in view, sharp and not too "
                 "steep?"
@@ -64,6 +62,12 @@ def look(files: list[Path], board: "Board") -> Found:
     return Found(shape[1], shape[0], names, views, board, left_out)
 
 
+def _read(file: Path) -> np.ndarray:
+    image = read_image(file)
+    assert image is not None, file
+    return image
+
+
 def _most(shapes: dict[Path, tuple[int, int]]) -> tuple[int, int]:
     """The size that most images have."""
     (shape, count), *others = Counter(shapes.values()).most_common(2)
@@ -75,12 +79,9 @@ def _most(shapes: dict[Path, tuple[int, int]]) -> tuple[int, int]:
     return shape
 
 
-def _hint(files: list[Path], board: "Board") -> str:
+def _hint(files: list[Path], board: Board) -> str:
     """Which other board it might be: squares were counted, one side wrongly, or across first."""
-    from sofjax.vision import read_image
-    from sofjax.vision.boards import find_points, recognise
-
-    images = [read_image(file) for file in files[:4]]
+    images = [_read(file) for file in files[:HINTED]]
     columns, rows = board.columns, board.rows
     for sides in (
         *((columns - 1, rows - 1), (columns - 2, rows - 2), (columns, rows - 1)),
@@ -115,39 +116,6 @@ def files(given: list[Path]) -> list[Path]:
             raise InputError(f"{path}: no image there; images end in {known}")
         found += images
     return found
-
-
-def board(args: argparse.Namespace) -> "Board":
-    """The board of --pattern, --board, --square and --marker, checked."""
-    from sofjax.vision.boards import Board
-
-    sides = args.board.lower().replace("×", "x").split("x")
-    what = {"chessboard": "inner corners", "charuco": "squares"}.get(args.pattern, "circles")
-    if len(sides) != 2 or not all(re.fullmatch(" *[0-9]{1,9} *", side) for side in sides):
-        raise InputError(
-            f"--board is {quoted(args.board)}; it must be the {what} along and across, like 9x6"
-        )
-    columns, rows = map(int, sides)
-    if not (MIN_CORNERS <= min(columns, rows) and max(columns, rows) <= MAX_CORNERS):
-        raise InputError(
-            f"--board is {quoted(args.board)}; each side must have from {MIN_CORNERS} to "
-            f"{MAX_CORNERS} {what}"
-        )
-    if not 0 < args.square <= 1:  # also what is no number
-        raise InputError(
-            f"--square is {args.square:g}; it must be the side of a square in metres, such as 0.03"
-        )
-    if args.pattern != "charuco":
-        if args.marker is not None:
-            raise InputError("--marker goes with --pattern charuco alone; leave it out")
-        return Board(columns, rows, args.square, args.pattern)
-    if args.marker is None or not 0 < args.marker < args.square:
-        given = "missing" if args.marker is None else f"{args.marker:g}"
-        raise InputError(
-            f"--marker is {given}; it must be the side of a charuco board's markers in metres, "
-            "less than --square"
-        )
-    return Board(columns, rows, args.square, args.pattern, args.marker)
 
 
 def _by(shape: tuple[int, int]) -> str:

@@ -1,0 +1,33 @@
+"""What a user chooses by a word, and the outcomes that a user reads: the values are the sentences.
+
+Imports nothing, as the argument parser needs the words.
+"""
+
+from enum import StrEnum
+
+LOOPS = ("none", "paper", "smooth")  # after the drive: nothing, the paper's closing, smoothing
+
+
+class LoopStatus(StrEnum):
+    """How far a run came with what is solved after the drive."""
+
+    UNFINISHED = "not finished"  # stays in the report of a run that was killed
+    INTERRUPTED = "interrupted"
+    SOLVED = "solved"
+    NOTHING = "nothing to solve"
+
+
+class FitVerdict(StrEnum):
+    """What a fitted mount is worth."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    NOT_USABLE = "not usable"
+
+
+class DriveVerdict(StrEnum):
+    """What a drive is worth."""
+
+    GOOD = "good"
+    USABLE = "usable: see the warnings"
+    DOUBTFUL = "doubtful: a run on it would mislead; see the warnings"
