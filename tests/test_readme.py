@@ -36,7 +36,7 @@ def test_the_python_blocks_run_one_after_the_other():
 def test_the_commands_that_it_shows_are_understood():
     for line in "".join(blocks("sh")).splitlines():
         for command in re.findall(r"sofjax ([^;&]*)", line):
-            makemake_parser().parse_args(shlex.split(command.replace("$seed", "1"), comments=True))
+            make_parser().parse_args(shlex.split(command.replace("$seed", "1"), comments=True))
 
 
 def test_what_it_links_to_and_names_is_there():
