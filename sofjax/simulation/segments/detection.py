@@ -28,7 +28,7 @@ class Detection(eqx.Module):
     noise: float = 0.25  # pixels, standard deviation of an end across the line
     shortening: float = 1.5  # pixels that an end is short of the edge's, mean size
     missed: float = 0.1  # share of edges of good contrast that are not seen
-    least_contrast: float = 0.04  # step of brightness below which no edge is seen
+    min_contrast: float = 0.04  # step of brightness below which no edge is seen
     full_contrast: float = 0.1  # ... and from which its contrast is good; between, in proportion
     blur: float = 1.05  # pixels, standard deviation: lens, pixels and detector together
     broken: float = 0.25  # share of edges that come in two pieces

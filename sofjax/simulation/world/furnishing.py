@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from sofjax.simulation.world.plan import (
-    distance_to_way,
+    distance_to_path,
     left_normal,
     offset_walls,
     parts_inside,
     wall_directions,
 )
-from sofjax.simulation.world.types import Areas, Lines, brightness, rectangle
+from sofjax.simulation.world.types import Areas, FloorLines, brightness, rectangle
 
 BLOCK_WIDTH, BLOCK_SPACING = 0.45, 2.3  # metres; section IV.A
 
@@ -46,8 +46,8 @@ class Paint:
         corners, colours = np.array(self.corners, float), np.array(self.colours, float)
         return Areas(corners.reshape(-1, 4, 2), colours.reshape(-1, 3), tuple(self.kinds))
 
-    def lines(self) -> Lines:
-        return Lines(
+    def lines(self) -> FloorLines:
+        return FloorLines(
             np.array(self.line_endpoints, float).reshape(-1, 2, 2),
             np.array(self.line_widths, float),
             np.array(self.line_colours, float).reshape(-1, 3),
@@ -76,7 +76,7 @@ def contrasting(
 
 
 def blocks(rng: np.random.Generator, plan: "Plan", floor: np.ndarray, paint: Paint) -> None:
-    """The paper's floor: dark blocks across the way, 0.45 m wide, about 2.3 m apart."""
+    """The paper's floor: dark blocks across the corridor, 0.45 m wide, about 2.3 m apart."""
     colour = contrasting(rng, floor, 0.18, 0.35, darker=True)
     for i, (x0, y0, x1, y1) in enumerate(plan.corridors):
         along_x = x1 - x0 > y1 - y0
@@ -155,7 +155,7 @@ def planks(rng: np.random.Generator, plan: "Plan", floor: np.ndarray, paint: Pai
 
 
 def stripes(rng: np.random.Generator, plan: "Plan", floor: np.ndarray, paint: Paint) -> None:
-    """A border stripe along the walls, and joints across the way between slabs of some metres."""
+    """A border stripe along the walls; joints across the corridor between long slabs."""
     colour = contrasting(rng, floor, 0.15, 0.35)
     near, width = rng.uniform(0.15, 0.3), rng.uniform(0.06, 0.15)
     inner = offset_walls(plan.corridors, plan.walls, near)
@@ -186,7 +186,7 @@ class Plan:
 
     corridors: Float[np.ndarray, "n 4"]
     walls: Float[np.ndarray, "walls 2 2"]
-    way: Float[np.ndarray, "points 2"]
+    waypoints: Float[np.ndarray, "points 2"]
 
     def stretches(self, i: int, others: list[int]) -> list[tuple[float, float]]:
         """Where corridor `i`, along its length, is not covered by the others."""
@@ -275,7 +275,7 @@ def hang_lamps(rng: np.random.Generator, plan: Plan) -> tuple[np.ndarray, np.nda
 def put_boxes(
     rng: np.random.Generator, plan: Plan, count: int, clearance: float = 0.55
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Clutter beside the walls, out of the robot's way."""
+    """Clutter beside the walls, clear of the waypoints."""
     boxes, colours = [], []
     for _ in range(count):
         w = rng.integers(len(plan.walls))
@@ -293,7 +293,7 @@ def put_boxes(
         box = np.concatenate([corners.min(0), corners.max(0)])
         gaps = [np.maximum(box[:2] - other[2:4], other[:2] - box[2:]).max() for other in boxes]
         if (
-            distance_to_way(plan.way, rectangle(*box)).min() > clearance
+            distance_to_path(plan.waypoints, rectangle(*box)).min() > clearance
             and min(gaps, default=1) > 0
         ):
             boxes.append(np.append(box, rng.choice([0.3, 0.45, 0.8, 1.5])))
