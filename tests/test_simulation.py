@@ -34,7 +34,7 @@ from sofjax.simulation import (
     webcam,
 )
 from sofjax.simulation.robot import clearance, drive_along, increments, read_path
-from sofjax.simulation.world.furnishing import BLOCK_SPACING, BLOCK_WIDTH
+from sofjax.simulation.world.floors import BLOCK_SPACING, BLOCK_WIDTH
 from sofjax.simulation.world.plan import inside, offset_walls, parts_inside, union_walls
 from sofjax.simulation.world.types import Areas
 

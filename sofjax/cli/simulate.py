@@ -29,7 +29,6 @@ def run(args: argparse.Namespace) -> int:
     if args.way is not None:
         world = dataclasses.replace(world, waypoints=_way(args.way))
     setup, imaging = choose_setup(args), _imaging(args)
-    imaging.check()
     simulated = simulate_run(world, setup, args.seed, args.images)
 
     def progress(frames: Iterable) -> Iterable:

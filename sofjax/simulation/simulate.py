@@ -47,6 +47,40 @@ class RobotSetup:
     dropped: float = 0.01  # share of the readings that are lost
     vibration: float = math.radians(0.1)  # radians, of the mount's pitch and roll at full speed
 
+    def __post_init__(self) -> None:
+        """Refuse numbers that cannot be, in a sentence."""
+        odometer, driver = self.odometer, self.driver
+        for name, value in (
+            ("vibration in degrees", math.degrees(self.vibration)),
+            ("share of dropped readings", self.dropped),
+            ("noise of the odometer's distance", odometer.distance_noise),
+            ("noise of the odometer's heading", odometer.heading_noise),
+            ("noise of the odometer's turns", odometer.turn_noise),
+            ("number of slips per metre", odometer.slip),
+            ("jitter of the steering", driver.jitter),
+            ("scale of the odometer's distance", odometer.distance),
+            ("scale of the odometer's left turns", odometer.left),
+            ("scale of the odometer's right turns", odometer.right),
+        ):
+            if not 0 <= float(value) < math.inf:
+                raise InputError(f"the {name} is {float(value):g}; it must be 0 or more")
+        if self.dropped > 0.9:
+            raise InputError(
+                f"of the readings a share of {self.dropped:g} is dropped; at most 0.9 may be"
+            )
+        for name, value, unit in (
+            ("speed", driver.speed, "metres a second"),
+            ("turn rate", driver.turn_rate, "radians a second"),
+            ("image rate", self.image_rate, "images a second"),
+            ("odometry rate", self.odometry_rate, "readings a second"),
+        ):
+            if not 0 < value < math.inf:
+                raise InputError(f"the {name} is {value:g}; it must be more than 0 {unit}")
+        if driver.speed > 2:
+            raise InputError(
+                f"at {driver.speed:g} m/s a robot cannot take these bends; at most 2 may be"
+            )
+
 
 def random_setup(seed: int) -> RobotSetup:
     """A robot unlike others: its camera, the camera's place, and the errors of its odometer."""
@@ -139,14 +173,13 @@ def _shaken(mount: Mount, shake: np.ndarray) -> Mount:
     @jax.jit
     @jax.vmap
     def one(moved: Array) -> Mount:
-        pitch, roll = mount.pitch + moved[0], mount.roll + moved[1]
-        return Mount(mount.x, mount.y, mount.height, pitch, roll, mount.yaw)
+        return mount.tilted(moved[0], moved[1])
 
     return one(jnp.asarray(shake, mount.pitch.dtype))
 
 
 def check_setup(world: World, setup: RobotSetup) -> None:
-    """Refuse a robot that cannot be, in a sentence."""
+    """Refuse a camera that cannot see this world's floor, in a sentence."""
     camera, mount = setup.camera_file.camera, setup.camera_file.mount
     height = float(mount.height)
     if not 0 < height < world.ceiling:
@@ -162,37 +195,6 @@ def check_setup(world: World, setup: RobotSetup) -> None:
         raise InputError(
             f"with a pitch of {math.degrees(mount.pitch):g} degrees the camera sees no floor; "
             "pitch > 0 looks down"
-        )
-    odometer = setup.odometer
-    for name, value in (
-        ("vibration in degrees", math.degrees(setup.vibration)),
-        ("share of dropped readings", setup.dropped),
-        ("noise of the odometer's distance", odometer.distance_noise),
-        ("noise of the odometer's heading", odometer.heading_noise),
-        ("noise of the odometer's turns", odometer.turn_noise),
-        ("number of slips per metre", odometer.slip),
-        ("jitter of the steering", setup.driver.jitter),
-        ("scale of the odometer's distance", odometer.distance),
-        ("scale of the odometer's left turns", odometer.left),
-        ("scale of the odometer's right turns", odometer.right),
-    ):
-        if not 0 <= float(value) < math.inf:
-            raise InputError(f"the {name} is {float(value):g}; it must be 0 or more")
-    if setup.dropped > 0.9:
-        raise InputError(
-            f"of the readings a share of {setup.dropped:g} is dropped; at most 0.9 may be"
-        )
-    for name, value, unit in (
-        ("speed", setup.driver.speed, "metres a second"),
-        ("turn rate", setup.driver.turn_rate, "radians a second"),
-        ("image rate", setup.image_rate, "images a second"),
-        ("odometry rate", setup.odometry_rate, "readings a second"),
-    ):
-        if not 0 < value < math.inf:
-            raise InputError(f"the {name} is {value:g}; it must be more than 0 {unit}")
-    if setup.driver.speed > 2:
-        raise InputError(
-            f"at {setup.driver.speed:g} m/s a robot cannot take these bends; at most 2 may be"
         )
 
 

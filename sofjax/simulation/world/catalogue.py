@@ -6,14 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sofjax.io.errors import InputError, nearest, quoted
-from sofjax.simulation.world.furnishing import (
-    FLOORS,
-    Paint,
-    Plan,
-    fit_walls,
-    hang_lamps,
-    put_boxes,
-)
+from sofjax.simulation.world.floors import FLOORS, Paint, Plan
+from sofjax.simulation.world.furnishing import fit_walls, hang_lamps, put_boxes
 from sofjax.simulation.world.plan import distance_to_path, inside, union_walls
 from sofjax.simulation.world.types import Look, World
 
