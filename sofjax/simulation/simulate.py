@@ -94,15 +94,16 @@ def random_setup(seed: int) -> RobotSetup:
         yaw=math.radians(rng.normal(0, 1.5)),
     )
     camera_file = webcam(mount, focal=float(rng.uniform(240, 330)))
+    number = lambda value: jnp.asarray(value, float)
     odometer = Odometer(
-        distance=rng.normal(1, 0.012),
-        left=rng.normal(1.02, 0.035),
-        right=rng.normal(1.02, 0.035),
-        bend=rng.normal(0, 0.003),
-        distance_noise=rng.uniform(0.001, 0.008),
-        heading_noise=rng.uniform(0.001, 0.006),
-        turn_noise=rng.uniform(0.003, 0.02),
-        slip=rng.uniform(0, 0.05),
+        distance=number(rng.normal(1, 0.012)),
+        left=number(rng.normal(1.02, 0.035)),
+        right=number(rng.normal(1.02, 0.035)),
+        bend=number(rng.normal(0, 0.003)),
+        distance_noise=number(rng.uniform(0.001, 0.008)),
+        heading_noise=number(rng.uniform(0.001, 0.006)),
+        turn_noise=number(rng.uniform(0.003, 0.02)),
+        slip=number(rng.uniform(0, 0.05)),
     )
     driver = Driver(speed=float(rng.uniform(0.4, 0.9)), jitter=float(rng.uniform(0.02, 0.1)))
     return RobotSetup(camera_file, driver, odometer)

@@ -26,7 +26,7 @@ def draw_mount(
     """
     figure, (bars, *views) = new_figure((14.0, 5.2), 1, 3)
     limit = max(4.0, float(np.quantile(np.abs(after), 0.99)) * 1.5)
-    bins = np.linspace(-limit, limit, 61)
+    bins = np.linspace(-limit, limit, 61).tolist()
     for values, color, name in ((before, OLD, "old mount"), (after, NEW, "new mount")):
         rms = float(np.sqrt(np.mean(values**2)))
         inside = np.clip(values.ravel(), -limit, limit)

@@ -91,7 +91,11 @@ def seen_until(
 
     A line without breadth is an edge that does not fade, seen to `max_depth`.
     """
-    needed = 8**0.5 * detection.blur * jax.scipy.special.erfinv(safe_divide(wanted, contrast))
+    needed = (
+        8**0.5
+        * detection.blur
+        * jax.scipy.special.erfinv(safe_divide(jnp.asarray(wanted), contrast))
+    )
     fades = jnp.where(breadth > 0, breadth / jnp.maximum(needed, 1e-6), jnp.inf)
     return jnp.where(wanted < contrast, jnp.minimum(fades, detection.max_depth), 0)
 

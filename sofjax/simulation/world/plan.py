@@ -41,7 +41,7 @@ def inside(
 ) -> Bool[np.ndarray, "*batch"]:
     """Whether points lie in the union of rectangles."""
     p = points[..., None, :]
-    return ((p >= corridors[:, :2]) & (p <= corridors[:, 2:])).all(-1).any(-1)
+    return np.all((p >= corridors[:, :2]) & (p <= corridors[:, 2:]), axis=-1).any(-1)
 
 
 def left_normal(direction: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
