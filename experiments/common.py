@@ -27,8 +27,8 @@ from sofjax.simulation import (
     World,
     make_world,
     observe,
-    random_rig,
-    take_ride,
+    random_setup,
+    simulate_run,
 )
 
 M = 64  # segments an image
@@ -77,7 +77,7 @@ def config_of(preset: str = "default", **changes: dict[str, object]) -> slam.Sla
 
 
 class Drive(NamedTuple):
-    """A ride seen as segments, without images."""
+    """A simulated run seen as segments, without images."""
 
     camera: Camera
     mount: Mount
@@ -86,21 +86,23 @@ class Drive(NamedTuple):
     odometry: Trajectory  # at the images
 
 
-def take_drive(world, rig, seed: int, images: int | None = None, detection=LSD) -> Drive:
-    """Drive `rig` through `world` and see it as segments."""
-    ride = take_ride(world, rig, seed, most_images=images)
-    camera, mount = rig.camera_file.camera, rig.camera_file.mount
+def take_drive(world, setup, seed: int, images: int | None = None, detection=LSD) -> Drive:
+    """Drive `setup` through `world` and see it as segments."""
+    simulated = simulate_run(world, setup, seed, max_images=images)
+    camera, mount = setup.camera_file.camera, setup.camera_file.mount
     edges = sum(
         len(kind.contrast)
         for kind in (world.floor_segments, world.off_floor_segments, world.reflections)
     )
     scene = Scene.of(world, edges=2048 * -(-edges // 2048), walls=64 * -(-len(world.walls) // 64))
-    T = len(ride.truth.stamps)
+    T = len(simulated.truth.stamps)
     padded = lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -T % 100, axis=0)])
-    given = jax.tree.map(padded, (ride.mounts, ride.poses(), ride.motions()))
+    given = jax.tree.map(padded, (simulated.mounts, simulated.poses(), simulated.motions()))
     seen = _observe(scene, camera, *given, jax.random.key(seed), detection)
     observations = jax.tree.map(lambda leaf: np.asarray(leaf[:T]), seen)
-    return Drive(camera, mount, observations, ride.truth, ride.odometry.at(ride.truth.stamps))
+    return Drive(
+        camera, mount, observations, simulated.truth, simulated.odometry.at(simulated.truth.stamps)
+    )
 
 
 @jax.jit
@@ -110,7 +112,7 @@ def _observe(scene, camera, mounts, poses, motions, key, detection):
 
 def random_drive(name: str, seed: int, images: int | None = None) -> Drive:
     """A world of that name and a robot unlike others, both by the seed."""
-    return take_drive(make_world(name, seed), random_rig(seed), seed, images)
+    return take_drive(make_world(name, seed), random_setup(seed), seed, images)
 
 
 def stack(drives: list[Drive]) -> tuple[Camera, Mount, Observation]:

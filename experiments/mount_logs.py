@@ -9,7 +9,7 @@ import numpy as np
 
 from sofjax.calibration import distances, start_at
 from sofjax.motion import MotionModel
-from sofjax.simulation import Detection, Odometer, Scene, observe, random_rig, take_ride
+from sofjax.simulation import Detection, Odometer, Scene, observe, random_setup, simulate_run
 
 IMAGES = 160
 EXACT = Odometer(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -18,9 +18,9 @@ LSD = Detection(shortening=1.0, broken=0.0, false_segments=0.0, missed=0.05)
 
 
 def make_log(world, seed: int, noise: float, odometer: Odometer = EXACT):
-    """The camera of a random rig at rest on it, its true mount and its log, in float64."""
-    rig = dataclasses.replace(random_rig(seed), odometer=odometer, dropped=0.0, vibration=0.0)
-    ride = take_ride(world, rig, seed, IMAGES)
+    """The camera of a random robot setup, at rest on it, its true mount and its log, in float64."""
+    setup = dataclasses.replace(random_setup(seed), odometer=odometer, dropped=0.0, vibration=0.0)
+    simulated = simulate_run(world, setup, seed, IMAGES)
     scene = Scene.of(world, edges=2048, walls=256)
     scene = eqx.tree_at(
         lambda s: (s.contrast, s.width),
@@ -28,11 +28,11 @@ def make_log(world, seed: int, noise: float, odometer: Odometer = EXACT):
         (jnp.where(scene.on_floor, scene.contrast, 0), jnp.zeros_like(scene.width)),
     )
     log = _observe(
-        scene, rig.camera_file.camera, ride.mounts, ride.poses(), ride.motions(),
+        scene, setup.camera_file.camera, simulated.mounts, simulated.poses(), simulated.motions(),
         jax.random.key(seed), dataclasses.replace(LSD, noise=jnp.asarray(noise)),
     )  # fmt: skip
     double = lambda x: jnp.asarray(x, float if x.dtype.kind == "f" else x.dtype)
-    tree = (rig.camera_file.camera, rig.camera_file.mount, log)
+    tree = (setup.camera_file.camera, setup.camera_file.mount, log)
     return jax.tree.map(lambda x: double(np.asarray(x)), tree)
 
 

@@ -7,7 +7,7 @@ goes with it.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory, gaps
@@ -225,7 +225,7 @@ def _distance_if_near(points: np.ndarray, angles: np.ndarray, segments: np.ndarr
 def distance_to_points(points: np.ndarray, others: np.ndarray) -> np.ndarray:
     """[P] metres from each point to the nearest of the others [n, 2]."""
     distinct = np.unique(others, axis=0)  # a tree is slow on copies, as of a robot that stands
-    return cKDTree(distinct).query(points)[0]
+    return KDTree(distinct).query(points)[0]
 
 
 def _parts(rows: int, columns: int) -> list[slice]:

@@ -1,6 +1,7 @@
-"""The mount from pairs of segments: recovered, honest about its errors, and refused where blind."""
+"""The mount from pairs of segments: recovered, with honest errors, refused if unobservable."""
 
 import dataclasses
+import re
 
 import equinox as eqx
 import jax
@@ -10,10 +11,19 @@ import optimistix as optx
 import pytest
 from conftest import jit_quickly, make_camera
 
-from sofjax.calibration import TURNS, UNKNOWNS, FitConfig, PairNoise, Pairs, distances, expected
+from sofjax.calibration import (
+    TURNS,
+    UNKNOWNS,
+    FitConfig,
+    PairNoise,
+    SegmentPairs,
+    distances,
+    expected,
+)
 from sofjax.calibration import fit_mount as compiled_well
-from sofjax.calibration.fit import doubts, verdict
-from sofjax.calibration.floor_test import FloorTestConfig, on_floor
+from sofjax.calibration.assessment import FitOutcome, ambiguity, assess, doubts
+from sofjax.calibration.fit_drive import DriveFitConfig
+from sofjax.calibration.floor_test import FloorTestConfig, lies_on_floor
 from sofjax.calibration.pairs import Estimate, start_at
 from sofjax.calibration.tracks import TrackConfig, follow, relate
 from sofjax.extraction.observation import Observation
@@ -27,8 +37,8 @@ MOUNT = (0.05, 0.0, 0.6, 0.26, 0.02, 0.0)  # x, y, height, pitch, roll, yaw
 
 
 @jit_quickly
-def fit_mount(camera, mount, pairs, rules=None):
-    return compiled_well(camera, mount, pairs, rules or FitConfig())
+def fit_mount(camera, mount, pairs, config=None):
+    return compiled_well(camera, mount, pairs, config or FitConfig())
 
 
 FIT = {"height": 0.6, "pitch": 0.26, "roll": 0.02}
@@ -90,7 +100,9 @@ def make_pairs(camera, mount, rng, motion=None, angle=None, noise=0.0, z=0.0):
             for pose, point in zip(poses, points, strict=True)
         ]))  # fmt: skip
     images = [image + rng.normal(0, noise, image.shape) for image in images]
-    return Pairs(*map(jnp.asarray, images), T12, jnp.ones(N, bool), jnp.ones((N, 4)), jnp.arange(N))
+    return SegmentPairs(
+        *map(jnp.asarray, images), T12, jnp.ones(N, bool), jnp.ones((N, 4)), jnp.arange(N)
+    )
 
 
 def weighed(camera, mount, pairs, **noise):
@@ -171,8 +183,8 @@ def test_yaw_and_the_odometer_s_turns_can_be_free_too(camera, mount, rng):
     did = jax.vmap(Estimate(mount, bias).motion)(read)
     pairs = make_pairs(camera, turned, rng, np.column_stack([did.xy, did.yaw]))
     pairs = eqx.tree_at(lambda p: p.T_first_second, pairs, read)
-    rules = FitConfig(free=("height", "pitch", "roll", "yaw", *TURNS), prior_sigma=(9.0,) * 8)
-    found = fit_mount(camera, mount, pairs, rules)
+    config = FitConfig(free=("height", "pitch", "roll", "yaw", *TURNS), prior_sigma=(9.0,) * 8)
+    found = fit_mount(camera, mount, pairs, config)
     np.testing.assert_allclose(value(found), list(FIT.values()), atol=1e-3)
     assert float(found.mount.yaw) == pytest.approx(0.06, abs=1e-3)
     np.testing.assert_allclose(found.odometer, bias, atol=1e-3)
@@ -189,10 +201,10 @@ def test_an_odometer_put_far_off_its_prior_widens_all_error_bars(camera, mount, 
         pairs,
         jax.vmap(Estimate(mount, jnp.array([0.0, -0.3, 0.0, 0.0])).motion)(pairs.T_first_second),
     )
-    rules = FitConfig(free=("height", "pitch", "roll", "left"))
-    right, wrong = (fit_mount(camera, mount, p, rules) for p in (pairs, short))
+    config = FitConfig(free=("height", "pitch", "roll", "left"))
+    right, wrong = (fit_mount(camera, mount, p, config) for p in (pairs, short))
     assert float(right.birge_ratio) == 1 and doubts(right) == ""
-    sigmas = float(wrong.odometer[1]) / rules.prior_sigma[5]
+    sigmas = float(wrong.odometer[1]) / config.prior_sigma[5]
     assert float(wrong.birge_ratio) == pytest.approx(abs(sigmas)) and sigmas > 5
     assert "clock or odometer" in doubts(wrong)
     ratio = np.sqrt(np.diag(wrong.covariance)[:3] / np.diag(right.covariance)[:3])
@@ -209,8 +221,8 @@ def test_outliers_hardly_matter(camera, mount, rng):
 def test_height_and_the_odometer_s_scale_are_one(camera, mount, rng):
     """Both free, the priors alone share them out, and the covariance says so."""
     pairs = make_pairs(camera, mount, rng, noise=0.3)
-    rules = FitConfig(free=("height", "pitch", "roll", "distance"))
-    found = fit_mount(camera, mount, pairs, rules)
+    config = FitConfig(free=("height", "pitch", "roll", "distance"))
+    found = fit_mount(camera, mount, pairs, config)
     C = np.asarray(found.covariance)
     correlation = C[0, 4] / np.sqrt(C[0, 0] * C[4, 4])
     assert correlation > 0.8
@@ -219,7 +231,7 @@ def test_height_and_the_odometer_s_scale_are_one(camera, mount, rng):
 
 
 def implicit(camera, mount, pairs):
-    """The fitted (height, pitch, roll) by one end point, the way driven and the focal length."""
+    """The fitted (height, pitch, roll) by one end point, the path driven and the focal length."""
 
     def fitted(x):
         moved = eqx.tree_at(lambda p: p.second, pairs, pairs.second.at[3, 0].add(x[:2]))
@@ -289,56 +301,59 @@ def cramer_rao(camera, mount, pairs, sigma):
     return np.sqrt(np.diag(np.linalg.inv(information))) * [float(mount.height), 1, 1]
 
 
-def sentence(camera, mount, pairs):
-    rules = FitConfig()
-    found = fit_mount(camera, mount, weighed(camera, mount, pairs), rules)
-    usable, words = verdict(found, rules, pairs)
-    assert not usable
+def refusal(camera, mount, pairs):
+    config = FitConfig()
+    found = fit_mount(camera, mount, weighed(camera, mount, pairs), config)
+    assessment = assess(found, config, pairs)
+    assert not assessment.usable
     assert np.isfinite(found.covariance).all()
-    return found, words
+    return found, assessment
 
 
 def test_a_pure_rotation_has_no_height(camera, mount, rng):
     centred = eqx.tree_at(lambda m: m.x, mount, jnp.zeros(()))
     motion = np.stack([np.zeros(N), np.zeros(N), rng.uniform(-0.25, 0.25, N)], axis=1)
     pairs = make_pairs(camera, centred, rng, motion, noise=0.3)
-    found, words = sentence(camera, centred, pairs)
-    assert not bool(found.observable[0]) and int(np.abs(found.blind).argmax()) == 0
-    assert "height" in words
+    found, refused = refusal(camera, centred, pairs)
+    assert not bool(found.observable[0]) and int(np.abs(found.weakest).argmax()) == 0
+    assert refused.outcome is FitOutcome.NOT_OBSERVABLE and "height" in refused.sentence
 
 
 def test_lines_along_the_motion_have_no_height(camera, mount, rng):
     motion = np.stack([rng.uniform(0.3, 0.9, N), np.zeros(N), np.zeros(N)], axis=1)
     pairs = make_pairs(camera, mount, rng, motion, angle=np.zeros(N), noise=0.3)
-    found, words = sentence(camera, mount, pairs)
-    assert not bool(found.observable[0]) and "height" in words
+    found, refused = refusal(camera, mount, pairs)
+    assert not bool(found.observable[0]) and "height" in refused.sentence
 
 
 def test_few_pairs_are_none(camera, mount, pairs):
     few = eqx.tree_at(lambda p: p.valid, pairs, jnp.arange(N) < 12)
-    found, words = sentence(camera, mount, few)
-    assert not found.observable.any() and "12 pairs" in words
-    found, words = sentence(
+    found, refused = refusal(camera, mount, few)
+    assert refused.outcome is FitOutcome.TOO_FEW_PAIRS
+    assert not found.observable.any() and "12 pairs" in refused.sentence
+    found, refused = refusal(
         camera, mount, eqx.tree_at(lambda p: p.valid, pairs, jnp.zeros(N, bool))
     )
-    assert "0 pairs" in words and np.isfinite(value(found)).all()
+    assert "0 pairs" in refused.sentence and np.isfinite(value(found)).all()
 
 
 def test_what_stands_above_the_floor_is_told_by_its_height(camera, mount, rng):
     z = np.where(np.arange(N) // 6 % 3 == 0, 0.1, 0.0)  # six pairs of each line
     pairs = weighed(camera, mount, make_pairs(camera, mount, rng, noise=0.3, z=z))
     line = jnp.arange(N) // 6
-    floor = np.asarray(on_floor(FloorTestConfig(), camera, start_at(mount), pairs, line))
+    floor = np.asarray(lies_on_floor(FloorTestConfig(), camera, start_at(mount), pairs, line))
     assert floor[z == 0].mean() > 0.9 and floor[z > 0].mean() < 0.3
     wild = eqx.tree_at(
         lambda p: p.second, pairs, pairs.second + jnp.asarray(rng.normal(0, 15, (N, 2, 2)))
     )
-    assert not np.asarray(on_floor(FloorTestConfig(), camera, start_at(mount), wild, line)).any()
+    assert not np.asarray(
+        lies_on_floor(FloorTestConfig(), camera, start_at(mount), wild, line)
+    ).any()
 
 
 @pytest.fixture
 def log(camera, mount, rng):
-    """Forty images on a straight way over twelve lines, with a little noise; one is missed once."""
+    """Forty images on a straight path over twelve lines, slightly noisy; one is missed once."""
     ends = np.zeros((12, 2, 3))
     angle = np.linspace(0.3, 2.8, 12)
     along = 0.3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -374,9 +389,9 @@ def test_lines_are_followed_though_missed_once_and_the_mount_is_rough(camera, mo
 
 def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
     log, _ = log
-    rules = TrackConfig()
+    config = TrackConfig()
     unread = dataclasses.replace(log, motion_sigma=jnp.zeros((40, 3)).at[20].set(0.1))
-    track = follow(rules, camera, start_at(mount), unread)
+    track = follow(config, camera, start_at(mount), unread)
     before, behind = (np.unique(part[part >= 0]) for part in (track[:20], track[20:]))
     assert len(before) == 12 and not np.intersect1d(before, behind).size
     known = without_unread_motions(log)
@@ -395,8 +410,8 @@ def test_pairs_are_nested_and_use_each_segment_once(camera, mount, log):
     pairs, line = relate(TrackConfig(), log, track, 0.6, 256)
     valid = np.asarray(pairs.valid)
     assert valid.sum() > 60 and len(np.unique(np.asarray(line)[valid])) == 12
-    way = np.asarray(pairs.T_first_second.xy)[valid, 0]
-    assert way.min() >= 0.3 - 1e-9 and way.max() <= 1.2 + 1e-9
+    path = np.asarray(pairs.T_first_second.xy)[valid, 0]
+    assert path.min() >= 0.3 - 1e-9 and path.max() <= 1.2 + 1e-9
     used = np.concatenate([np.asarray(pairs.first)[valid], np.asarray(pairs.second)[valid]])
     assert len(np.unique(used.reshape(-1, 4), axis=0)) == len(used)
     assert (np.asarray(line)[~valid] == -1).all()
@@ -410,3 +425,29 @@ def test_unknowns_are_in_the_order_of_the_covariance(camera, mount, pairs):
     found = fit_mount(camera, mount, pairs, FitConfig(free=("pitch",)))
     assert UNKNOWNS[1] == "pitch"
     assert np.flatnonzero(np.diag(np.asarray(found.covariance)) > 0).tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: FitConfig(free=("pitch", "heigth")), "FitConfig.free must be some of height"),
+        (lambda: FitConfig(min_pairs=0), "FitConfig.min_pairs must be a whole number from 1"),
+        (lambda: FitConfig(limit=(0.05, 0.02)), "FitConfig.limit must be 8 numbers above 0"),
+        (lambda: FitConfig(prior_sigma=(-1.0,) * 8), "FitConfig.prior_sigma must be 8 numbers"),
+        (lambda: FloorTestConfig(max_rms=0.0), "FloorTestConfig.max_rms must be a number above 0"),
+        (lambda: TrackConfig(max_lag=0), "TrackConfig.max_lag must be a whole number from 1"),
+        (lambda: PairNoise(pixel_sigma=-0.5), "PairNoise.pixel_sigma must be a number from 0"),
+        (lambda: DriveFitConfig(starts=()), "DriveFitConfig.starts must be one or more pairs"),
+        (lambda: DriveFitConfig(capacity=0), "DriveFitConfig.capacity must be a whole number"),
+    ],
+)
+def test_bad_settings_are_refused_by_name(make, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        make()
+
+
+def test_starts_that_end_in_different_places_are_ambiguous():
+    found = ambiguity(np.array([[0.6, 0.26, 0.02], [0.7, 0.26, 0.03]]))
+    assert found.outcome is FitOutcome.AMBIGUOUS and not found.usable
+    assert "from 2 starts" in found.sentence and "heights 0.600 to 0.700 m" in found.sentence
+    assert "pitch" not in found.sentence and "roll 1.1 to 1.7°" in found.sentence

@@ -24,17 +24,17 @@ from sofjax.simulation import (
     Imaging,
     Odometer,
     Renderer,
-    Rig,
+    RobotSetup,
     Scene,
     make_world,
     observe,
-    random_rig,
+    random_setup,
     record,
-    take_ride,
+    simulate_run,
     webcam,
 )
 from sofjax.simulation.robot import clearance, drive_along, increments, read_path
-from sofjax.simulation.world.furnishing import BLOCK_SPACING, BLOCK_WIDTH
+from sofjax.simulation.world.floors import BLOCK_SPACING, BLOCK_WIDTH
 from sofjax.simulation.world.plan import inside, offset_walls, parts_inside, union_walls
 from sofjax.simulation.world.types import Areas
 
@@ -49,9 +49,9 @@ def world_of(name, seed=0):
 
 
 @cache
-def ride_of(name, seed=0):
-    still = Rig(vibration=0.0, dropped=0.0)
-    return take_ride(world_of(name, seed), still, seed)
+def run_of(name, seed=0):
+    still = RobotSetup(vibration=0.0, dropped=0.0)
+    return simulate_run(world_of(name, seed), still, seed)
 
 
 def office_camera():
@@ -121,7 +121,7 @@ def test_the_papers_blocks_have_its_width_and_spacing():
     np.testing.assert_allclose(size.min(1), BLOCK_WIDTH)
     first = marks.mean(1)[abs(marks.mean(1)[:, 0]) < 0.5]  # of the left corridor
     np.testing.assert_allclose(np.diff(np.sort(first[:, 1])), BLOCK_SPACING, atol=0.05)
-    assert np.ptp(world.way, axis=0) == pytest.approx([11.5, 24])
+    assert np.ptp(world.waypoints, axis=0) == pytest.approx([11.5, 24])
 
 
 def test_a_world_is_the_same_for_a_seed_and_another_for_another():
@@ -143,9 +143,9 @@ def test_random_worlds_have_every_floor():
 @pytest.mark.parametrize(("name", "seed"), SAMPLES)
 def test_a_drive_keeps_off_the_walls_and_arrives(name, seed):
     world = world_of(name, seed)
-    path = drive_along(world.way, Driver(), np.random.default_rng(seed))
+    path = drive_along(world.waypoints, Driver(), np.random.default_rng(seed))
     assert clearance(world.walls, path) > 0.3
-    assert np.linalg.norm(path.xy[-1] - world.way[-1]) < 0.2
+    assert np.linalg.norm(path.xy[-1] - world.waypoints[-1]) < 0.2
     speed = np.linalg.norm(np.diff(path.xy, axis=0), axis=1) / np.diff(path.stamps)
     assert speed.max() <= Driver().speed + 1e-6
 
@@ -156,7 +156,7 @@ PERFECT = Odometer(
 
 
 def test_a_perfect_odometer_reads_the_true_path():
-    truth = ride_of("l").truth
+    truth = run_of("l").truth
     read = read_path(PERFECT, truth, jax.random.key(0))
     first = SE2(jnp.asarray(truth.xy[0]), jnp.asarray(truth.yaw[0]))
     back = jax.vmap(first.apply)(jnp.asarray(read.xy, first.xy.dtype))
@@ -187,23 +187,26 @@ def test_the_odometers_noise_adds_up_alike_however_the_path_is_cut():
 
 
 def test_the_papers_robot_spins_inward_on_a_clockwise_loop():
-    ride = ride_of("paper")
-    assert ride.truth.yaw[-1] - ride.truth.yaw[0] == pytest.approx(-2 * np.pi, abs=0.1)
-    assert ride.odometry.yaw[-1] < -2 * np.pi * 1.03
+    simulated = run_of("paper")
+    assert simulated.truth.yaw[-1] - simulated.truth.yaw[0] == pytest.approx(-2 * np.pi, abs=0.1)
+    assert simulated.odometry.yaw[-1] < -2 * np.pi * 1.03
 
 
 def test_readings_are_dropped_and_the_ends_stay():
-    rig = Rig(dropped=0.3)
-    ride = take_ride(world_of("l"), rig)
-    all_of_it = ride_of("l").odometry
-    assert 0.6 < len(ride.odometry.stamps) / len(all_of_it.stamps) < 0.8
-    assert ride.odometry.stamps[0] == 0 and ride.odometry.stamps[-1] >= ride.truth.stamps[-1]
+    setup = RobotSetup(dropped=0.3)
+    simulated = simulate_run(world_of("l"), setup)
+    all_of_it = run_of("l").odometry
+    assert 0.6 < len(simulated.odometry.stamps) / len(all_of_it.stamps) < 0.8
+    assert (
+        simulated.odometry.stamps[0] == 0
+        and simulated.odometry.stamps[-1] >= simulated.truth.stamps[-1]
+    )
 
 
 def test_the_mount_shakes_by_what_is_asked():
-    ride = take_ride(world_of("l"), Rig(vibration=np.radians(0.1)))
-    moving = np.linalg.norm(np.gradient(ride.truth.xy, axis=0), axis=1) > 0.065
-    pitch = np.degrees(np.asarray(ride.mounts.pitch))[moving]
+    simulated = simulate_run(world_of("l"), RobotSetup(vibration=np.radians(0.1)))
+    moving = np.linalg.norm(np.gradient(simulated.truth.xy, axis=0), axis=1) > 0.065
+    pitch = np.degrees(np.asarray(simulated.mounts.pitch))[moving]
     assert 0.07 < pitch.std() < 0.13
 
 
@@ -268,16 +271,16 @@ def behind_a_wall(world, nadir, points, margin=0.05):
     return (apart & (side(nadir, ends, a) * side(nadir, ends, b) <= 0)).any(1)
 
 
-def edge_offsets(world, camera_file, ride, frames, kinds, narrow):
+def edge_offsets(world, camera_file, simulated, frames, kinds, narrow):
     """Distances in pixels of drawn edges from where the truth projects, along the normal."""
     renderer = Renderer(world, camera_file, CLEAN)
     truth = world.floor_segments
     offsets = []
     for i in frames:
-        R, C = numpy_pose(camera_file, ride.truth.xy[i], ride.truth.yaw[i])
-        grey = cv2.cvtColor(renderer.draw(R, C, ride.truth.stamps[i]), cv2.COLOR_BGR2GRAY).astype(
-            np.float32
-        )
+        R, C = numpy_pose(camera_file, simulated.truth.xy[i], simulated.truth.yaw[i])
+        grey = cv2.cvtColor(
+            renderer.draw(R, C, simulated.truth.stamps[i]), cv2.COLOR_BGR2GRAY
+        ).astype(np.float32)
         for ends, kind in zip(truth.endpoints, truth.kinds, strict=True):
             if kind not in kinds:
                 continue
@@ -327,10 +330,10 @@ def ridge(t, profile):
 
 def test_written_truth_lands_on_the_drawn_edges():
     world = dataclasses.replace(world_of("paper", 3), **NO_BOXES)
-    ride = ride_of("paper", 3)
+    simulated = run_of("paper", 3)
     mount = Mount.create(height=1.0, pitch=0.21, x=0.1, y=0.03, roll=0.02, yaw=-0.03)
-    frames = range(5, len(ride.truth.stamps), 200)
-    offsets = edge_offsets(world, webcam(mount), ride, frames, {"mark", "wall"}, narrow=False)
+    frames = range(5, len(simulated.truth.stamps), 200)
+    offsets = edge_offsets(world, webcam(mount), simulated, frames, {"mark", "wall"}, narrow=False)
     assert len(offsets) > 100
     assert np.abs(np.median(offsets)) < 0.05
     assert np.quantile(np.abs(offsets), 0.95) < 0.3
@@ -338,8 +341,10 @@ def test_written_truth_lands_on_the_drawn_edges():
 
 def test_written_truth_lands_on_the_middle_of_drawn_joints():
     world = dataclasses.replace(world_of("l", 2), **NO_BOXES)
-    ride = ride_of("l", 2)
-    offsets = edge_offsets(world, office_camera(), ride, range(5, 200, 40), {"grout"}, narrow=True)
+    simulated = run_of("l", 2)
+    offsets = edge_offsets(
+        world, office_camera(), simulated, range(5, 200, 40), {"grout"}, narrow=True
+    )
     assert len(offsets) > 100
     assert np.abs(np.median(offsets)) < 0.05
     assert np.quantile(np.abs(offsets), 0.9) < 0.3
@@ -418,14 +423,16 @@ def test_any_lens_can_be_drawn_through(model, distortion):
 
 def test_lsd_errs_on_drawn_images_as_on_the_sample_drive():
     """Within a factor of 1.5 of the sample's 1.2 cm and 0.28 degrees, medians within 5 m."""
-    world, camera_file, ride = world_of("l", 2), office_camera(), ride_of("l", 2)
+    world, camera_file, simulated = world_of("l", 2), office_camera(), run_of("l", 2)
     renderer = Renderer(world, camera_file, Imaging())
     K = np.asarray(camera_file.camera.K, float)
     truth = world.floor_segments.endpoints[:, :, :2]
     rho, theta = [], []
-    for i in range(0, len(ride.truth.stamps), 6):
-        R, C = numpy_pose(camera_file, ride.truth.xy[i], ride.truth.yaw[i])
-        image = cv2.undistort(renderer.draw(R, C, ride.truth.stamps[i]), K, camera_file.distortion)
+    for i in range(0, len(simulated.truth.stamps), 6):
+        R, C = numpy_pose(camera_file, simulated.truth.xy[i], simulated.truth.yaw[i])
+        image = cv2.undistort(
+            renderer.draw(R, C, simulated.truth.stamps[i]), K, camera_file.distortion
+        )
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         lines = cv2.createLineSegmentDetector().detect(grey)[0].reshape(-1, 2, 2) + 0.125
         inverse = np.linalg.inv(K @ R.T @ np.column_stack([[1, 0, 0], [0, 1, 0], -C]))
@@ -451,7 +458,7 @@ def test_lsd_errs_on_drawn_images_as_on_the_sample_drive():
 
 CAMERA = Camera(jnp.array([[291.0, 0.0, 159.5], [0.0, 291.0, 119.5], [0.0, 0.0, 1.0]]), 320, 240)
 EXACT = Detection(
-    noise=0.0, shortening=0.0, missed=0.0, least_contrast=0.0, full_contrast=1e-6, broken=0.0,
+    noise=0.0, shortening=0.0, missed=0.0, min_contrast=0.0, full_contrast=1e-6, broken=0.0,
     false_segments=0.0, shortest=3.0, max_depth=8.0,
 )  # fmt: skip
 
@@ -475,23 +482,25 @@ def without_width(scene):
 
 
 def seen_exactly(name, seed, frames):
-    ride = ride_of(name, seed)
-    poses = jax.tree.map(lambda leaf: leaf[jnp.asarray(frames)], ride.poses())
-    mounts = jax.tree.map(lambda leaf: leaf[jnp.asarray(frames)], ride.mounts)
+    simulated = run_of(name, seed)
+    poses = jax.tree.map(lambda leaf: leaf[jnp.asarray(frames)], simulated.poses())
+    mounts = jax.tree.map(lambda leaf: leaf[jnp.asarray(frames)], simulated.mounts)
     key = jax.random.key(0)
-    return ride, look(without_width(scene_of(name, seed)), CAMERA, mounts, poses, poses, key, EXACT)
+    return simulated, look(
+        without_width(scene_of(name, seed)), CAMERA, mounts, poses, poses, key, EXACT
+    )
 
 
 @pytest.mark.parametrize(("name", "seed"), [("l", 2), ("eight", 0), ("random", 3)])
 def test_exact_segments_are_visible_parts_of_the_worlds_edges(name, seed):
     frames = list(range(10, 250, 50))
     world = world_of(name, seed)
-    ride, observed = seen_exactly(name, seed, frames)
+    simulated, observed = seen_exactly(name, seed, frames)
     camera_file = CameraFile(CAMERA, webcam().mount, np.zeros(5), "plumb_bob", "")
     edges = [world.floor_segments, world.off_floor_segments, world.reflections]
     ends = np.concatenate([kind.endpoints for kind in edges])
     for row, i in enumerate(frames):
-        R, C = numpy_pose(camera_file, ride.truth.xy[i], ride.truth.yaw[i])
+        R, C = numpy_pose(camera_file, simulated.truth.xy[i], simulated.truth.yaw[i])
         segments = np.asarray(observed.segments_image.endpoints[row], float)
         valid = np.asarray(observed.segments_image.valid[row])
         assert valid.sum() > 3
@@ -548,11 +557,12 @@ def test_the_longest_segments_fit_and_the_rest_is_counted():
 
 
 def forty_drives():
-    """Stretches of one ride, each as if it were a drive."""
-    ride = ride_of("paper")
+    """Stretches of one simulated run, each as if it were a drive."""
+    simulated = run_of("paper")
     starts = jnp.arange(100, 1100, 25)[:, None] + jnp.arange(FRAMES)[None]
     poses, mounts = (
-        jax.tree.map(lambda leaf: leaf[starts], tree) for tree in (ride.poses(), ride.mounts)
+        jax.tree.map(lambda leaf: leaf[starts], tree)
+        for tree in (simulated.poses(), simulated.mounts)
     )
     return mounts, poses, poses, jax.random.split(jax.random.key(0), DRIVES)
 
@@ -635,7 +645,7 @@ def test_a_fine_lines_edges_are_never_nearer_than_the_blur_leaves_them(y, width)
 
 def test_a_fine_line_fades_with_distance_and_a_step_does_not():
     def seen_from(width):
-        detection = dataclasses.replace(EXACT, least_contrast=0.05, full_contrast=0.05001, blur=1.0)
+        detection = dataclasses.replace(EXACT, min_contrast=0.05, full_contrast=0.05001, blur=1.0)
         ys = np.arange(1.5, 7.0, 0.25)
         return ys, np.array([len(edges_of_line(one_line(y, width), detection)) for y in ys])
 
@@ -651,7 +661,7 @@ def test_a_fine_line_that_runs_away_ends_where_it_fades_and_its_edges_converge()
     scene = one_line(2.0, 0.008)
     ends = scene.edges_world.at[0].set(jnp.array([[0.3, 1.0, 0.0], [0.3, 9.0, 0.0]]))
     scene = dataclasses.replace(scene, edges_world=ends)
-    detection = dataclasses.replace(EXACT, least_contrast=0.05, full_contrast=0.05001, blur=1.0)
+    detection = dataclasses.replace(EXACT, min_contrast=0.05, full_contrast=0.05001, blur=1.0)
     found = edges_of_line(scene, detection)
     assert len(found) == 2
     found = found[np.arange(2)[:, None], np.argsort(-found[:, :, 1], axis=1)]  # near end first
@@ -668,7 +678,7 @@ def test_a_joint_of_a_world_comes_as_its_two_edges_by_chance():
     mounts = jax.tree.map(lambda leaf: leaf[0], forty_drives()[0])
 
     def count(**changes):
-        detection = dataclasses.replace(EXACT, least_contrast=0.03, full_contrast=0.1, **changes)
+        detection = dataclasses.replace(EXACT, min_contrast=0.03, full_contrast=0.1, **changes)
         observed = look(scene, CAMERA, mounts, pose, pose, jax.random.key(0), detection)
         return int(observed.segments_image.valid.sum())
 
@@ -690,7 +700,7 @@ def test_a_world_with_more_edges_than_room_is_refused():
 @pytest.mark.slow
 def test_a_hundred_drives_take_seconds():
     drives, images = 100, 300
-    scene, ride = scene_of("paper"), ride_of("paper")
+    scene, simulated = scene_of("paper"), run_of("paper")
 
     def batch(tree):
         return jax.tree.map(
@@ -701,9 +711,13 @@ def test_a_hundred_drives_take_seconds():
         return observe(scene, CAMERA, mounts, poses, poses, key)
 
     keys = jax.random.split(jax.random.key(0), drives)
-    see = jax.jit(jax.vmap(one)).lower(batch(ride.mounts), batch(ride.poses()), keys).compile()
+    see = (
+        jax.jit(jax.vmap(one))
+        .lower(batch(simulated.mounts), batch(simulated.poses()), keys)
+        .compile()
+    )
     begun = time.perf_counter()
-    jax.block_until_ready(see(batch(ride.mounts), batch(ride.poses()), keys))
+    jax.block_until_ready(see(batch(simulated.mounts), batch(simulated.poses()), keys))
     assert time.perf_counter() - begun < 10
     memory = see.memory_analysis()
     assert memory.temp_size_in_bytes + memory.output_size_in_bytes < 4 * 2**30
@@ -715,17 +729,17 @@ def test_a_hundred_drives_take_seconds():
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     path = tmp_path_factory.mktemp("drives") / "short"
-    rig = Rig(camera_file=office_camera())
-    ride = take_ride(world_of("l", 2), rig, 2, most_images=12)
-    record(path, world_of("l", 2), rig, ride, seed=2)
-    return path, ride
+    setup = RobotSetup(camera_file=office_camera())
+    simulated = simulate_run(world_of("l", 2), setup, 2, max_images=12)
+    record(path, world_of("l", 2), setup, simulated, seed=2)
+    return path, simulated
 
 
 def test_a_recorded_drive_reads_back(recorded):
-    path, ride = recorded
+    path, simulated = recorded
     drive = read_drive(path)
     assert len(drive.image_files) == 12 and all(file.exists() for file in drive.image_files)
-    np.testing.assert_allclose(drive.groundtruth.xy, ride.truth.xy, atol=1e-6)
+    np.testing.assert_allclose(drive.groundtruth.xy, simulated.truth.xy, atol=1e-6)
     np.testing.assert_allclose(drive.camera_file.distortion, office_camera().distortion)
     expected = world_of("l", 2).floor_segments.endpoints[:, :, :2]
     np.testing.assert_allclose(drive.floor_segments, expected, atol=5.1e-5)
@@ -733,8 +747,8 @@ def test_a_recorded_drive_reads_back(recorded):
 
 
 def test_the_written_odometry_gives_the_motions_that_observe_takes(recorded):
-    path, ride = recorded
-    written, given = motions(read_drive(path)), ride.motions()
+    path, simulated = recorded
+    written, given = motions(read_drive(path)), simulated.motions()
     np.testing.assert_allclose(written[:, :2], given.xy, atol=1e-4)
     np.testing.assert_allclose(written[:, 2], given.yaw, atol=1e-4)
 
@@ -750,7 +764,7 @@ def test_simulate_writes_a_drive(tmp_path, capsys):
 
 
 def test_random_rigs_differ():
-    heights = {round(float(random_rig(seed).camera_file.mount.height), 3) for seed in range(5)}
+    heights = {round(float(random_setup(seed).camera_file.mount.height), 3) for seed in range(5)}
     assert len(heights) == 5
 
 
@@ -799,11 +813,9 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path, capsys):
 
 
 def test_increments_of_a_path_begin_with_none():
-    steps = increments(ride_of("l").truth)
+    steps = increments(run_of("l").truth)
     assert float(steps.xy[0, 0]) == 0 and float(steps.yaw[0]) == 0
-    pairs = itertools.islice(
-        zip(ride_of("l").truth.yaw[1:], ride_of("l").truth.yaw, strict=False), 5
-    )
+    pairs = itertools.islice(zip(run_of("l").truth.yaw[1:], run_of("l").truth.yaw, strict=False), 5)
     np.testing.assert_allclose([a - b for a, b in pairs], steps.yaw[1:6], atol=1e-6)
 
 

@@ -24,7 +24,7 @@ import common
 
 from sofjax import slam
 from sofjax.io.drive import read_drive
-from sofjax.simulation import make_world, random_rig, record, take_ride
+from sofjax.simulation import make_world, random_setup, record, simulate_run
 from sofjax.vision import Frontend, FrontendSettings, observe_drive
 
 FLOORS = ("blocks", "tiles", "diamonds", "planks", "stripes")
@@ -95,18 +95,18 @@ def run_variant(variant: str, drives: list[common.Drive], keys) -> list[float]:
 
 def drawn_drives(seed: int, images: int) -> dict[str, common.Drive]:
     """One drive drawn, and what LSD and Hough find in its images."""
-    world, rig = make_world("random", seed), random_rig(seed)
-    ride = take_ride(world, rig, seed, most_images=images)
-    odometry, found = ride.odometry.at(ride.truth.stamps), {}
+    world, setup = make_world("random", seed), random_setup(seed)
+    simulated = simulate_run(world, setup, seed, max_images=images)
+    odometry, found = simulated.odometry.at(simulated.truth.stamps), {}
     with tempfile.TemporaryDirectory() as folder:
-        record(Path(folder) / "drive", world, rig, ride, seed=seed)
+        record(Path(folder) / "drive", world, setup, simulated, seed=seed)
         drive = read_drive(Path(folder) / "drive")
         camera, mount = drive.camera_file.camera, drive.camera_file.mount
         for detector in ("lsd", "hough"):
             settings = FrontendSettings(detector=detector, capacity=common.M)
             log = observe_drive(drive, Frontend(drive.camera_file, settings))
             log = jax.tree.map(np.asarray, log)
-            found[detector] = common.Drive(camera, mount, log, ride.truth, odometry)
+            found[detector] = common.Drive(camera, mount, log, simulated.truth, odometry)
     return found
 
 

@@ -69,7 +69,7 @@ def fit_rules(setting: Setting) -> DriveFitConfig:
     """The odometer is as exact as it is; its turns are free only where they err."""
     turns = TURNS if setting.odometer.right != 1 else ()
     return DriveFitConfig(
-        track=TrackConfig(baseline=setting.longest / 4, longest=setting.longest),
+        track=TrackConfig(min_baseline=setting.longest / 4, max_baseline=setting.longest),
         noise=PairNoise(setting.noise, EXACT_MODEL),
         fit=FitConfig(free=(*MOUNT, *turns), pixel_sigma=setting.noise),
         starts=((1.0, 0.0),),
@@ -83,7 +83,7 @@ def study(setting: Setting, seed: int) -> dict:
     camera, mount, log = make_log(world, seed, setting.noise, setting.odometer)
     rules = fit_rules(setting)
     found = fit_drive(camera, roughly(mount), log, rules)
-    usable, why = found.verdict(rules)
+    verdict = found.verdict(rules)
     best = float(setting.odometer.distance) * mount.height  # all that can be seen of it
     true = np.array([best, mount.pitch, mount.roll])
     m = found.fit.mount
@@ -91,8 +91,8 @@ def study(setting: Setting, seed: int) -> dict:
     least = cramer_rao(camera, mount, found.pairs, jnp.asarray(setting.noise))
     return {
         "seed": seed,
-        "usable": usable,
-        "why": why,
+        "usable": verdict.usable,
+        "why": verdict.sentence,
         "pairs": int(found.pairs.valid.sum()),
         "height": float(mount.height),
         "error": error.tolist(),

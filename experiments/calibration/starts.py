@@ -64,15 +64,17 @@ def main() -> None:
             m, seconds = found.fit.mount, time.process_time() - begun
             end = np.array([m.height, m.pitch, m.roll])
             off = (end - told) / unit
-            usable, why = found.verdict(rules)
+            verdict = found.verdict(rules)
             row = [float(begin.height), float(begin.pitch)]
-            rows.append({"begin": row, "end": end, "off": off, "usable": usable, "why": why,
+            rows.append({"begin": row, "end": end, "off": off, "usable": verdict.usable,
+                         "why": verdict.sentence,
                          "sigma": np.sqrt(np.diag(found.covariance))[:3],
                          "odometer": found.fit.odometer,
                          "processor_seconds": seconds})  # fmt: skip
             print(f"{row[0]:.3f} m, {np.degrees(row[1]):5.1f}°  {end[0]:.4f} m, "
                   f"{np.degrees(end[1]):6.3f}°, {np.degrees(end[2]):6.3f}°  {off[0]:+6.2f} %, "
-                  f"{off[1]:+.3f}°, {off[2]:+.3f}°  {seconds:5.1f}  {why}", flush=True)  # fmt: skip
+                  f"{off[1]:+.3f}°, {off[2]:+.3f}°  {seconds:5.1f}  "
+                  f"{verdict.sentence}", flush=True)  # fmt: skip
     off, ends = np.array([row["off"] for row in rows]), np.array([row["end"] for row in rows])
     worst, apart = np.abs(off).max(0), np.ptp(ends, axis=0) / unit
     said = lambda x: f"{x[0]:.2f} %, {x[1]:.3f}°, {x[2]:.3f}°"

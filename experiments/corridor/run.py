@@ -23,13 +23,13 @@ import common
 from sofjax.cli import main as sofjax
 from sofjax.simulation import (
     Areas,
-    Lines,
+    FloorLines,
     World,
     make_world,
-    random_rig,
+    random_setup,
     record,
     rectangle,
-    take_ride,
+    simulate_run,
 )
 
 KINDS = ("bars", "joints", "bare")
@@ -57,9 +57,9 @@ def straight(seed: int, kind: str, length: float) -> World:
         name="corridor",
         corridors=np.array([[low, -side, high, side]]),
         walls=walls,
-        way=np.array([[0.0, 0.0], [length, 0.0]]),
+        waypoints=np.array([[0.0, 0.0], [length, 0.0]]),
         floor_areas=paint(stripes + bars, ["stripe"] * 2 + ["mark"] * len(bars)),
-        floor_lines=Lines(
+        floor_lines=FloorLines(
             cross, np.full(len(at), 0.02), np.tile(0.5 * grey, (len(at), 1)), ("joint",) * len(at)
         ),
         wall_areas=paint([rectangle(0, 0, high - low, board)] * 2, ["baseboard"] * 2),
@@ -73,7 +73,7 @@ def straight(seed: int, kind: str, length: float) -> World:
 
 def run_seeds(seeds: list[int], kind: str, length: float) -> list[dict]:
     """Distance driven, error and spread along the corridor at each image, of every seed."""
-    drives = [common.take_drive(straight(s, kind, length), random_rig(s), s) for s in seeds]
+    drives = [common.take_drive(straight(s, kind, length), random_setup(s), s) for s in seeds]
     rows = []
     for first in range(0, len(seeds), 5):
         mine = drives[first : first + 5]
@@ -95,8 +95,8 @@ def run_seeds(seeds: list[int], kind: str, length: float) -> list[dict]:
 def what_is_said(seed: int, kind: str, length: float, folder: Path) -> dict:
     """The drawn drive's warnings, and its spread and errors as reported."""
     shutil.rmtree(folder, ignore_errors=True)
-    world, rig = straight(seed, kind, length), random_rig(seed)
-    record(folder / "drive", world, rig, take_ride(world, rig, seed), seed=seed)
+    world, setup = straight(seed, kind, length), random_setup(seed)
+    record(folder / "drive", world, setup, simulate_run(world, setup, seed), seed=seed)
     run = ["run", str(folder / "drive"), "--out", str(folder / "run"), "--loop", "none"]
     if code := sofjax(run):
         raise SystemExit(code)

@@ -27,7 +27,7 @@ import optimistix as optx
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax.simulation import make_world, random_rig
+from sofjax.simulation import make_world, random_setup
 
 NOISE = (
     ("sensor", "pixel_sigma"), ("sensor", "tilt_sigma"),
@@ -43,12 +43,14 @@ SHAKY = 4.0  # times the noise of mount and odometer
 
 def shaky_drive(name: str, seed: int, images: int) -> common.Drive:
     """The same world, driven by the same robot in a worse state."""
-    rig = random_rig(seed)
+    setup = random_setup(seed)
     where = lambda o: (o.distance_noise, o.heading_noise, o.turn_noise)
-    odometer = eqx.tree_at(where, rig.odometer, [SHAKY * noise for noise in where(rig.odometer)])
-    rig = dataclasses.replace(rig, odometer=odometer, vibration=SHAKY * rig.vibration)
+    odometer = eqx.tree_at(
+        where, setup.odometer, [SHAKY * noise for noise in where(setup.odometer)]
+    )
+    setup = dataclasses.replace(setup, odometer=odometer, vibration=SHAKY * setup.vibration)
     detection = dataclasses.replace(common.LSD, noise=2 * common.LSD.noise)
-    return common.take_drive(make_world(name, seed), rig, seed, images, detection)
+    return common.take_drive(make_world(name, seed), setup, seed, images, detection)
 
 
 STARTS = {  # times the default noise, and the drives

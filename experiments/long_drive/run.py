@@ -21,7 +21,7 @@ import common
 
 from sofjax import smoothing
 from sofjax.evaluation import evaluate_trajectory
-from sofjax.simulation import around, furnish, random_rig
+from sofjax.simulation import around, furnish, random_setup
 
 WIDTH, HEIGHT, GAP = 7.0, 11.0, 5.0  # metres, of a ring and to the next
 
@@ -66,7 +66,7 @@ def main() -> None:
     parser.add_argument("--rings", type=int, default=16)
     args = parser.parse_args()
     args.rings = 1 if args.quick else args.rings
-    drive = common.take_drive(make_rings(args.seed, args.rings), random_rig(args.seed), args.seed)
+    drive = common.take_drive(make_rings(args.seed, args.rings), random_setup(args.seed), args.seed)
     config = common.config_of(segment_map={"capacity": 8192})
     camera, mount, log = common.one_of(common.stack([drive]), 0)
     told = {"images": len(drive.truth.stamps), "peak_gib": {"observed": peak()}, "seconds": {}}

@@ -24,7 +24,7 @@ from sofjax import loop_closure, smoothing
 from sofjax.evaluation import evaluate_trajectory
 from sofjax.geometry import SE2
 from sofjax.io.trajectory import Trajectory
-from sofjax.simulation import around, furnish, random_rig
+from sofjax.simulation import around, furnish, random_setup
 
 FLOORS = ("blocks", "tiles", "stripes", "planks")  # of the drives without a loop
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the way, at which poses are judged
@@ -55,7 +55,7 @@ def make_way(seed: int, size: float = 1.0):
 def drive_one(kind: str, seed: int, size: float) -> dict[str, object]:
     """Run, smooth, close; and what the truth says of it."""
     world = (make_loop if kind == "loop" else make_way)(seed, size)
-    drive = common.take_drive(world, random_rig(seed), seed)
+    drive = common.take_drive(world, random_setup(seed), seed)
     camera, mount, log = common.one_of(common.stack([drive]), 0)
     T, config = len(drive.truth.stamps), common.config_of()
     start = SofSlam(config, camera, mount).init(jax.random.key(seed), common.M)

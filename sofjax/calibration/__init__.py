@@ -1,5 +1,7 @@
 """Where the camera sits on the robot, from what it sees while driving."""
 
+from sofjax.calibration.assessment import Assessment as Assessment
+from sofjax.calibration.assessment import FitOutcome as FitOutcome
 from sofjax.calibration.fit import CalibrationResult as CalibrationResult
 from sofjax.calibration.fit import FitConfig as FitConfig
 from sofjax.calibration.fit import fit_mount as fit_mount
@@ -10,7 +12,7 @@ from sofjax.calibration.pairs import TURNS as TURNS
 from sofjax.calibration.pairs import UNKNOWNS as UNKNOWNS
 from sofjax.calibration.pairs import Estimate as Estimate
 from sofjax.calibration.pairs import PairNoise as PairNoise
-from sofjax.calibration.pairs import Pairs as Pairs
+from sofjax.calibration.pairs import SegmentPairs as SegmentPairs
 from sofjax.calibration.pairs import distances as distances
 from sofjax.calibration.pairs import expected as expected
 from sofjax.calibration.pairs import start_at as start_at

@@ -1,16 +1,19 @@
-"""The mount by least squares over pairs, and what it cannot know."""
+"""The mount by least squares over pairs, with its covariance and what the pairs do not show."""
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from sofjax._checks import check_fields
 from sofjax.calibration.pairs import (
-    TURNS,
     UNKNOWNS,
-    Pairs,
+    SegmentPairs,
     U,
     all_distances,
     start_at,
@@ -18,79 +21,119 @@ from sofjax.calibration.pairs import (
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.smoothing.problem import robust
 
-MOUNT = ("height", "pitch", "roll")  # what is free unless told otherwise
+MOUNT = ("height", "pitch", "roll")  # what is free by default
 
 
 class FitConfig(eqx.Module):
-    """What is free, what is known beforehand, and when an answer is one."""
+    """What is free, what is known beforehand, and how well an answer must be known."""
 
     free: tuple[str, ...] = eqx.field(static=True, default=MOUNT)  # of UNKNOWNS
     # standard deviations: log height; pitch, roll, yaw in radians; the odometer's errors
     prior_sigma: tuple[float, ...] = (3.0, 1.0, 1.0, 1.0, 0.02, 0.05, 0.05, 0.005)
     loss_scale: float = 2.0  # residuals, in sigmas, from which they count linearly only
-    # of an answer at most
+    # the largest standard deviations of an answer, in the units of `prior_sigma`
     limit: tuple[float, ...] = (0.05, 0.02, 0.02, 0.02, 0.05, 0.1, 0.1, 0.01)
-    pixel_sigma: float = 0.5  # noise of the end points that what seems to be known is held against
+    pixel_sigma: float = 0.5  # pixels: jitter whose information does not count, see `_sandwich`
     min_pairs: int = 20
+
+    def __check_init__(self) -> None:
+        check_fields(self, positive=("loss_scale", "pixel_sigma"), whole_from={"min_pairs": 1})
+        for name in self.free:
+            if name not in UNKNOWNS:
+                raise ValueError(
+                    f"FitConfig.free must be some of {', '.join(UNKNOWNS)}, not {name!r}"
+                )
+        for field in ("prior_sigma", "limit"):
+            numbers = getattr(self, field)
+            plain = all(isinstance(n, int | float | np.number) for n in numbers)
+            if len(numbers) != U or (plain and not all(0 < n < np.inf for n in numbers)):
+                raise ValueError(f"FitConfig.{field} must be {U} numbers above 0, not {numbers!r}")
 
 
 DEFAULT = FitConfig()
 ODOMETER = slice(4, None)  # of UNKNOWNS
-DOUBT = 2.0  # of `birge_ratio`: three errors are together so far off by chance in 1 of 140 drives
 
 
 class CalibrationResult(eqx.Module):
-    """A fitted mount, and how sure it is."""
+    """A fitted mount, and how well it is known."""
 
     mount: Mount
     odometer: Float[Array, "4"]  # its systematic errors b, see `MotionModel`; 0 where not free
     covariance: Float[Array, "8 8"]  # of UNKNOWNS, in metres, radians and shares; 0 if not free
     residuals: Float[Array, "N 4"]  # pixels; 0 where a pair is not valid
     observable: Bool[Array, "8"]  # whether each of UNKNOWNS was free and the pairs fix it
-    blind: Float[Array, "8"]  # the direction that is known least, in shares of `limit`, a unit ...
-    blindness: Float[Array, ""]  # ... and its standard deviation in the same; > 1 is no answer
-    # how far off its prior the odometer had to be put, root mean square in sigmas, 1 at least: the
-    # covariance is wider by it
+    # the direction that is known least: a unit vector in shares of `limit`, and its standard
+    # deviation in the same shares; above 1 the fit is no answer
+    weakest: Float[Array, "8"]
+    weakest_sigma: Float[Array, ""]
+    # RMS of the odometer's errors over their priors, in sigmas, at least 1; the covariance is
+    # multiplied by its square
     birge_ratio: Float[Array, ""]
     cost: Float[Array, ""]  # half the sum of robust squares, in sigmas
     result: optx.RESULTS  # of the solver; an estimate that did not converge is the best so far
 
 
+class _Terms(eqx.Module):
+    """What `_fit` takes of its settings, as arrays: one compiled program for all of them."""
+
+    is_free: Bool[Array, "8"]
+    prior_sigma: Float[Array, "8"]
+    limit: Float[Array, "8"]
+    loss_scale: Float[Array, ""]
+    min_pairs: Int[Array, ""]
+    pixel_sigma: Float[Array, ""]
+
+
+Residuals = Callable[[Float[Array, "8"], SegmentPairs], Float[Array, "N 4"]]
+
+
 def fit_mount(
-    camera: Camera, mount: Mount, pairs: Pairs, rules: FitConfig = DEFAULT, max_steps: int = 60
+    camera: Camera,
+    mount: Mount,
+    pairs: SegmentPairs,
+    config: FitConfig = DEFAULT,
+    max_steps: int = 60,
 ) -> CalibrationResult:
-    """Find the mount that carries the floor's lines from image to image; Levenberg-Marquardt.
+    """The mount that carries the floor's lines from image to image; Levenberg-Marquardt.
 
     Pure; `jax.vmap` runs it over logs and over starts, and its estimate has derivatives by all of
     `camera`, `pairs` and the mount's lever arm, by the implicit function theorem. Wants float64.
 
-    Only the height over the odometer's scale of distance can be seen: with 'distance' free too,
-    the priors share the two out.
+    Only the ratio of the height to the odometer's scale of distance is observable. With 'distance'
+    free too, the priors decide how the two share it.
 
     **Arguments:**
-    - `mount`: where to begin, and the middle of the priors; what is not free stays as it is.
+    - `mount`: where to begin, and the mean of the priors; what is not free stays as it is.
     - `pairs`: associations and sigmas, which stay as they are.
     """
-    is_free = jnp.array([name in rules.free for name in UNKNOWNS])
-    numbers = map(jnp.asarray, (rules.prior_sigma, rules.limit, rules.loss_scale, rules.min_pairs,
-                                rules.pixel_sigma))  # fmt: skip
-    return _fit(camera, mount, pairs, is_free, *numbers, max_steps)
+    terms = _Terms(
+        is_free=jnp.array([name in config.free for name in UNKNOWNS]),
+        prior_sigma=jnp.asarray(config.prior_sigma),
+        limit=jnp.asarray(config.limit),
+        loss_scale=jnp.asarray(config.loss_scale),
+        min_pairs=jnp.asarray(config.min_pairs),
+        pixel_sigma=jnp.asarray(config.pixel_sigma),
+    )
+    return _fit(camera, mount, pairs, terms, max_steps)
 
 
 @eqx.filter_jit  # one program, whatever is free
 def _fit(
-    camera, mount, pairs, is_free, prior, limit, loss_scale, min_pairs, pixel_sigma, max_steps
-):
+    camera: Camera, mount: Mount, pairs: SegmentPairs, terms: _Terms, max_steps: int
+) -> CalibrationResult:
     start = start_at(mount)
+    is_free, prior = terms.is_free, terms.prior_sigma
 
-    def residuals(by, pairs):
+    def residuals(by: Float[Array, "8"], pairs: SegmentPairs) -> Float[Array, "N 4"]:
         by = jnp.where(is_free, by, 0)
         r = all_distances(camera, start.moved(by), pairs) / pairs.sigma
         r = jnp.where(pairs.valid[:, None], r, 0)
-        # the four distances of a pair are two equations said from both sides: they count half
-        return jax.vmap(robust, in_axes=(0, None))(r / 2**0.5, loss_scale)
+        # the four distances of a pair are two equations stated from both sides: they count half
+        return jax.vmap(robust, in_axes=(0, None))(r / 2**0.5, terms.loss_scale)
 
-    def with_priors(by, _):
+    def with_priors(
+        by: Float[Array, "8"], _: None
+    ) -> tuple[Float[Array, "N 4"], Float[Array, "8"]]:
         return residuals(by, pairs), jnp.where(is_free, by / prior, by)
 
     found = optx.least_squares(
@@ -103,38 +146,44 @@ def _fit(
     by = jnp.where(is_free, found.value, 0)
     estimate = start.moved(by)
     birge_ratio = _birge_ratio(by[ODOMETER] / prior[ODOMETER], is_free[ODOMETER])
-    covariance = birge_ratio**2 * _sandwich(residuals, by, pairs, prior, pixel_sigma)
+    covariance = birge_ratio**2 * _sandwich(residuals, by, pairs, prior, terms.pixel_sigma)
     covariance = jnp.where(is_free[:, None] & is_free, covariance, 0)
-    spread, direction, sure = _blindness(limit, covariance)
-    enough = jnp.sum(pairs.valid) >= min_pairs
+    weakest_sigma, weakest, known_well = _weakest(terms.limit, covariance)
+    enough = jnp.sum(pairs.valid) >= terms.min_pairs
     unit = jnp.ones(U).at[0].set(estimate.mount.height)  # log height to metres
-    r, known = with_priors(by, None)
+    r, r_priors = with_priors(by, None)
     return CalibrationResult(
         mount=estimate.mount,
         odometer=estimate.bias,
         covariance=covariance * jnp.outer(unit, unit),
         residuals=jnp.where(pairs.valid[:, None], all_distances(camera, estimate, pairs), 0),
-        observable=is_free & sure & enough,
-        blind=direction,
-        blindness=spread,
+        observable=is_free & known_well & enough,
+        weakest=weakest,
+        weakest_sigma=weakest_sigma,
         birge_ratio=birge_ratio,
-        cost=0.5 * (jnp.sum(r**2) + jnp.sum(known**2)),
+        cost=0.5 * (jnp.sum(r**2) + jnp.sum(r_priors**2)),
         result=found.result,
     )
 
 
-def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "8 8"]:
+def _sandwich(
+    residuals: Residuals,
+    by: Float[Array, "8"],
+    pairs: SegmentPairs,
+    prior: Float[Array, "8"],
+    pixel_sigma: Float[Array, ""],
+) -> Float[Array, "8 8"]:
     """Covariance of the estimate from how the clusters disagree: A^-1 (Σ g gᵀ) A^-1.
 
-    Errors of pairs that share images, a line or an odometer's reading are correlated, and the
-    inverse information alone is too small by much. `g` is each cluster's gradient at the estimate,
-    as it would be without that cluster's own pull on it (the jackknife).
+    Errors of pairs that share images, a line or an odometer's reading are correlated: the inverse
+    information alone is much too small. `g` is each cluster's gradient at the estimate, as it
+    would be had the cluster not taken part in the fit (the jackknife).
 
-    Few clusters may agree by chance: no direction is known better than by independent pairs that
-    miss each other as these do.
+    A few clusters may agree by chance. So no direction gets a variance below that of independent
+    pairs with residuals as large as these.
 
-    Noise turns segments that tell nothing into some that seem to tell a little, and if all there
-    is is noise then that adds up: what jittered segments would tell is not counted in A.
+    Noise of the end points makes some segments look informative that are not. The information
+    that jittered segments would add is measured, and not counted in A.
     """
     jacobian = jax.jacfwd(residuals)
     J, r = jacobian(by, pairs), residuals(by, pairs)
@@ -152,10 +201,10 @@ def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "
         lambda p: (p.first, p.second), pairs, (pairs.first + jitter[0], pairs.second + jitter[1])
     )
     L = jnp.linalg.cholesky(A)
-    told = jacobian(by, jittered) - J
-    told = jnp.einsum("nri,nrj->ij", told, told)
+    from_noise = jacobian(by, jittered) - J
+    from_noise = jnp.einsum("nri,nrj->ij", from_noise, from_noise)
     from_left = lambda M: jax.scipy.linalg.solve_triangular(L, M, lower=True)
-    share, axes = jnp.linalg.eigh(from_left(from_left(told).T))
+    share, axes = jnp.linalg.eigh(from_left(from_left(from_noise).T))
     P = axes / (1 - jnp.clip(share, 0, 0.99)) @ axes.T
     values, axes = jnp.linalg.eigh(P @ from_left(from_left(middle).T) @ P.T)
     count = 2 * jnp.sum(pairs.valid.astype(r.dtype))
@@ -164,74 +213,23 @@ def _sandwich(residuals, by, pairs: Pairs, prior, pixel_sigma) -> Float[Array, "
     return root * jnp.maximum(values, independent) @ root.T
 
 
-def _birge_ratio(off, is_free) -> Float[Array, ""]:
-    """How far values lie off their priors, root mean square in sigmas; 1 at least (Birge's ratio).
+def _birge_ratio(off: Float[Array, "4"], is_free: Bool[Array, "4"]) -> Float[Array, ""]:
+    """RMS of how far values lie off their priors, in sigmas, at least 1 (Birge's ratio).
 
-    What the clusters share, such as a wrong lens or clock, no covariance from their differences
-    shows: it shows in an odometer that must be further off than odometers are.
+    An error that all clusters share, such as a wrong lens or clock, does not show in their
+    differences. It shows in an odometer that must be further off than odometers are.
     """
     count = jnp.maximum(jnp.sum(is_free.astype(off.dtype)), 1)
     return jnp.sqrt(jnp.maximum(jnp.sum(jnp.where(is_free, off, 0) ** 2) / count, 1))
 
 
-def _blindness(limit, covariance):
-    """The widest direction of the covariance in units of what an answer may have at most."""
+def _weakest(
+    limit: Float[Array, "8"], covariance: Float[Array, "8 8"]
+) -> tuple[Float[Array, ""], Float[Array, "8"], Bool[Array, "8"]]:
+    """The widest direction of the covariance in units of `limit`: its sigma, and a unit vector.
+
+    The last value is, for each unknown, whether its own standard deviation is below its limit.
+    """
     values, vectors = jnp.linalg.eigh(covariance / jnp.outer(limit, limit))
     spread = jnp.sqrt(jnp.maximum(values[-1], 0))
     return spread, vectors[:, -1], jnp.diag(covariance) < limit**2
-
-
-def verdict(found: CalibrationResult, rules: FitConfig, pairs: Pairs) -> tuple[bool, str]:
-    """Whether a fit is an answer, and in words what could not be observed."""
-    count, limit = int(pairs.valid.sum()), rules.limit
-    if count < rules.min_pairs:
-        return False, (
-            f"{count} pairs of segments on the floor were found, and {rules.min_pairs} are needed: "
-            "the drive shows too few lines on the floor, or is too short"
-        )
-    sigma = jnp.sqrt(jnp.diag(found.covariance)).at[0].divide(found.mount.height)
-    wide = [
-        f"the {_ERRORS.get(name, name)} ({_amount(name, float(s))})"
-        for name, s, most in zip(UNKNOWNS, sigma, limit, strict=True)
-        if name in rules.free and name not in TURNS and s > most  # nobody asked for the turns
-    ]
-    if wide:
-        doubt = doubts(found)
-        return False, f"not observable from this drive: {' and '.join(wide)}; {doubt or _WHY}"
-    if found.result != optx.RESULTS.successful:
-        return False, "the fit did not converge"
-    return True, ""
-
-
-def doubts(found: CalibrationResult) -> str:
-    """What speaks against a fit that converged, in words; empty if nothing."""
-    birge_ratio = float(found.birge_ratio)
-    if birge_ratio < DOUBT:
-        return ""
-    return (
-        f"it takes an odometer {birge_ratio:.1f} times further off than odometers are, "
-        "so camera, clock or odometer are not what they are taken for, and the errors told are "
-        "wider by as much"
-    )
-
-
-_WHY = (
-    "the height takes driving some metres, not turning on the spot, over lines that lie across the "
-    "way, and the tilt lines that come nearer"
-)
-
-
-_ERRORS = {
-    "distance": "odometer's error in distance",
-    "left": "odometer's error in left turns",
-    "right": "odometer's error in right turns",
-    "curvature": "odometer's pull to one side",
-}
-
-
-def _amount(name: str, sigma: float) -> str:
-    if name in ("height", "distance", "left", "right"):
-        return f"known to {100 * sigma:.2g} %"
-    if name == "curvature":
-        return f"known to {sigma * 57.29578:.2g}° a metre"
-    return f"known to {sigma * 57.29578:.2g}°"

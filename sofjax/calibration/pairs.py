@@ -1,10 +1,11 @@
-"""Two measurements of one line, a baseline apart, and how well the mount makes them agree."""
+"""Pairs of measurements of one line, and their distances under a mount; eqs. (4) to (8)."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sofjax._checks import check_fields
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.lines import cofactor, line_point_distance, line_through
 from sofjax.geometry.se2 import SE2
@@ -13,18 +14,18 @@ from sofjax.motion import MotionModel
 
 UNKNOWNS = ("height", "pitch", "roll", "yaw", "distance", "left", "right", "curvature")
 U = len(UNKNOWNS)
-TURNS = UNKNOWNS[5:]  # an odometer errs in these more than in anything: free with any mount
+TURNS = UNKNOWNS[5:]  # an odometer's largest errors: always free beside a mount
 
 
-class Pairs(eqx.Module):
-    """N pairs of segments that are taken for the same line of the floor."""
+class SegmentPairs(eqx.Module):
+    """N pairs of segments, each two measurements of one line of the floor."""
 
     first: Float[Array, "N 2 2"]  # end points in the first image, pixels, undistorted
     second: Float[Array, "N 2 2"]  # end points in the second
     T_first_second: SE2  # [N] the robot's motion between them, as the odometer read it
     valid: Bool[Array, "N"]
     sigma: Float[Array, "N 4"]  # standard deviations of the distances, pixels; see `expected`
-    cluster: Int[Array, "N"]  # pairs of one number may err together; from 0 to N - 1
+    cluster: Int[Array, "N"]  # errors of pairs with one number may be correlated; 0 to N - 1
 
 
 class Estimate(eqx.Module):
@@ -42,7 +43,7 @@ class Estimate(eqx.Module):
         return Estimate(mount, self.bias + by[4:])
 
     def motion(self, read: SE2) -> SE2:
-        """What the robot did where the odometer read this, a short motion."""
+        """The motion of the robot where the odometer read `read`, a short motion."""
         forward, sideways, turn = read.log()
         b = self.bias
         scaled = turn + jnp.maximum(turn, 0) * b[1] + jnp.minimum(turn, 0) * b[2]
@@ -52,7 +53,7 @@ class Estimate(eqx.Module):
 
 
 def start_at(mount: Mount) -> Estimate:
-    """A mount, and an odometer that is right."""
+    """The estimate of this mount and an odometer without systematic errors."""
     return Estimate(mount, jnp.zeros(4, jnp.result_type(mount.height)))
 
 
@@ -63,7 +64,7 @@ def distances(
     second: Float[Array, "2 2"],
     T_first_second: SE2,
 ) -> Float[Array, "4"]:
-    """How far each segment's ends lie from the other's line, carried over by the floor.
+    """Distances of each segment's ends from the other's line, which H transfers over the floor.
 
     Eqs. (4) to (8), symmetric: the ends of the second from l'' = H^-T l, then those of the first
     from Hᵀ l'.
@@ -77,7 +78,7 @@ def distances(
     return jnp.concatenate([to(l_second, second), to(l_first, first)])
 
 
-def all_distances(camera: Camera, estimate: Estimate, pairs: Pairs) -> Float[Array, "N 4"]:
+def all_distances(camera: Camera, estimate: Estimate, pairs: SegmentPairs) -> Float[Array, "N 4"]:
     """`distances` of all pairs, valid or not."""
     return jax.vmap(distances, in_axes=(None, None, 0, 0, 0))(
         camera, estimate, pairs.first, pairs.second, pairs.T_first_second
@@ -85,35 +86,41 @@ def all_distances(camera: Camera, estimate: Estimate, pairs: Pairs) -> Float[Arr
 
 
 class PairNoise(eqx.Module):
-    """What makes true pairs miss each other, about an exact mount."""
+    """Residual noise of correct pairs, with an exact mount."""
 
     pixel_sigma: float = 0.5  # pixels, of an end point across its segment
     odometer: MotionModel = MotionModel()  # its noise, and the priors of its errors in turning
 
+    def __check_init__(self) -> None:
+        check_fields(self, at_least_zero=("pixel_sigma",))
+
 
 @eqx.filter_jit
 def expected(
-    noise: PairNoise, camera: Camera, estimate: Estimate, pairs: Pairs
+    noise: PairNoise, camera: Camera, estimate: Estimate, pairs: SegmentPairs
 ) -> Float[Array, "N 4"]:
-    """Standard deviations of the distances: a short segment far off says little of a long line.
+    """Standard deviations of the distances, pixels.
 
-    Noise of all four end points, and of the odometer between the images, carried through the
-    residual's own Jacobian. Held fixed in a fit: a fit must not widen what it is judged by.
+    Noise of all four end points, and of the odometer between the images, propagated by the
+    Jacobian of `distances`. They stay fixed in a fit: otherwise it could lower its cost by larger
+    standard deviations.
     """
     model = noise.odometer
 
-    def one(first, second, T):
-        def of(first, second, twist):
+    def one(first: Float[Array, "2 2"], second: Float[Array, "2 2"], T: SE2) -> Float[Array, "4"]:
+        def of(
+            first: Float[Array, "2 2"], second: Float[Array, "2 2"], twist: Float[Array, "3"]
+        ) -> Float[Array, "4"]:
             return distances(camera, estimate, first, second, SE2.exp(twist))
 
         twist = T.log()
         by = jax.jacfwd(of, argnums=(0, 1, 2))(first, second, twist)
-        way, turn = jnp.abs(twist[0]), jnp.abs(twist[2])
+        length, turn = jnp.abs(twist[0]), jnp.abs(twist[2])
         moved = jnp.stack([
-            model.distance_noise**2 * way,
-            model.lateral_noise**2 * way,
-            model.heading_noise**2 * way + model.turn_noise**2 * turn
-            + (model.turn_scale_sigma * turn) ** 2 + (model.curvature_sigma * way) ** 2,
+            model.distance_noise**2 * length,
+            model.lateral_noise**2 * length,
+            model.heading_noise**2 * length + model.turn_noise**2 * turn
+            + (model.turn_scale_sigma * turn) ** 2 + (model.curvature_sigma * length) ** 2,
         ])  # fmt: skip
         seen = jnp.sum(by[0] ** 2, axis=(1, 2)) + jnp.sum(by[1] ** 2, axis=(1, 2))
         return jnp.sqrt(noise.pixel_sigma**2 * seen + by[2] ** 2 @ moved)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sofjax.calibration.pairs import Estimate, Pairs
+from sofjax._checks import check_fields
+from sofjax.calibration.pairs import Estimate, SegmentPairs
 from sofjax.extraction.observation import Observation
 from sofjax.extraction.sof import below_horizon
 from sofjax.geometry.angles import wrap
@@ -20,40 +21,47 @@ from sofjax.geometry.two_view import transfer_segment, two_view_homography
 
 
 class TrackConfig(eqx.Module):
-    """When segments of images that follow one another are one line, and what makes a pair."""
+    """When segments of successive images are one line, and which of them make a pair."""
 
-    gate: float = 6.0  # pixels that an end may lie off where the line was to be expected
-    turn_gate: float = 0.15  # radians between the directions; a line's two edges point either way
-    back: int = eqx.field(static=True, default=3)  # images that a line may be missed, and one
-    baseline: float = 0.5  # heights of the camera between the images of a pair at least ...
-    longest: float = 2.0  # ... and at most
-    min_views: int = 4  # of a line on such a way
+    gate: float = 6.0  # pixels, the largest distance of an end from the predicted line
+    turn_gate: float = 0.15  # radians between directions; a line's two edges have opposite ones
+    max_lag: int = eqx.field(static=True, default=3)  # images back that a line is searched in
+    min_baseline: float = 0.5  # smallest distance between the images of a pair, camera heights
+    max_baseline: float = 2.0  # and the largest
+    min_views: int = 4  # views of a line within the largest distance
+
+    def __check_init__(self) -> None:
+        check_fields(
+            self,
+            positive=("gate", "turn_gate", "min_baseline", "max_baseline"),
+            whole_from={"max_lag": 1, "min_views": 2},
+        )
 
 
 def follow(
-    rules: TrackConfig, camera: Camera, estimate: Estimate, log: Observation
+    config: TrackConfig, camera: Camera, estimate: Estimate, log: Observation
 ) -> Int[np.ndarray, "T M"]:
-    """A number for every segment, the same for those that follow one another; -1 for none.
+    """A number for every segment, the same for all segments of one line; -1 for none.
 
-    Images that follow one another are so near that a mount wrong by a third still tells where a
-    segment went; who is nearest to whom must be mutual. Nothing is followed over a motion that
-    the odometer does not tell.
+    Successive images are so near that a mount wrong by a third still predicts where a segment
+    went. Two segments are one line only if each is the nearest of the other. Nothing is followed
+    over a motion that the odometer did not read.
     """
-    partners = np.stack([np.asarray(p) for p in _partners(rules, camera, estimate, log)])
+    partners = np.stack([np.asarray(p) for p in _partners(config, camera, estimate, log)])
     valid = np.asarray(log.segments_image.valid)
     T, M = valid.shape
     track = np.full((T, M), -1)
     sigma = log.motion_sigma
-    untold = np.cumsum(np.zeros(T) if sigma is None else np.asarray(sigma > 0).any(-1))
+    unread = np.cumsum(np.zeros(T) if sigma is None else np.asarray(sigma > 0).any(-1))
     count = 0
     for t in range(T):
-        for lag in range(1, min(rules.back, t) + 1):
-            if untold[t] > untold[t - lag]:
+        for lag in range(1, min(config.max_lag, t) + 1):
+            if unread[t] > unread[t - lag]:
                 continue
             partner = partners[lag - 1, t]
             take = (track[t] < 0) & (partner >= 0)
             before = np.where(take, track[t - lag][partner], -1)
-            # whose line was seen since has gone on already
+            # a line that was seen since then continues from there
             before[np.isin(before, track[t - lag + 1 : t + 1])] = -1
             track[t] = np.where(take & (before >= 0), before, track[t])
         new = valid[t] & (track[t] < 0)
@@ -63,7 +71,9 @@ def follow(
 
 
 @eqx.filter_jit
-def _partners(rules: TrackConfig, camera: Camera, estimate: Estimate, log: Observation):
+def _partners(
+    config: TrackConfig, camera: Camera, estimate: Estimate, log: Observation
+) -> list[Int[Array, "T M"]]:
     """[T, M] for each lag: the segment so many images before that is the same line, or -1."""
     poses = path(jax.vmap(estimate.motion)(log.motion))
     floor = jax.vmap(below_horizon, in_axes=(None, None, 0))(
@@ -71,44 +81,47 @@ def _partners(rules: TrackConfig, camera: Camera, estimate: Estimate, log: Obser
     )
     index = jnp.arange(poses.yaw.shape[0])
 
-    def at(lag):
-        def one(t):
+    def at(lag: int) -> Int[Array, "T M"]:
+        def one(t: Int[Array, ""]) -> Int[Array, "M"]:
             before = jnp.maximum(t - lag, 0)
             at = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
             a, b = at(floor, before), at(floor, t)
             T = at(poses, before).between(at(poses, t))
             H = two_view_homography(camera, estimate.mount, T)
-            of_pair = lambda x, y: miss(rules, H, x, y)
+            of_pair = lambda x, y: transfer_error(config, H, x, y)
             off = jax.vmap(lambda y: jax.vmap(lambda x: of_pair(x, y))(a.endpoints))(b.endpoints)
             off = jnp.where(a.valid[None] & b.valid[:, None] & (t >= lag), off, jnp.inf)
             best = off.argmin(axis=1)
             mutual = off.argmin(axis=0)[best] == jnp.arange(len(best))
-            return jnp.where(mutual & (off.min(axis=1) < rules.gate), best, -1)
+            return jnp.where(mutual & (off.min(axis=1) < config.gate), best, -1)
 
         return jax.lax.map(one, index, batch_size=16)
 
-    return [at(lag) for lag in range(1, rules.back + 1)]
+    return [at(lag) for lag in range(1, config.max_lag + 1)]
 
 
-def miss(
-    rules: TrackConfig, H: Float[Array, "3 3"], first: Float[Array, "2 2"],
+def transfer_error(
+    config: TrackConfig, H: Float[Array, "3 3"], first: Float[Array, "2 2"],
     second: Float[Array, "2 2"],
 ) -> Float[Array, ""]:  # fmt: skip
-    """How far the second's ends lie from where the first was to go, pixels; inf if another line."""
+    """Largest distance of an end of `second` from the transferred `first`, pixels.
+
+    Infinite if the two cannot be one line.
+    """
     moved, ahead = transfer_segment(H, first)
     line = cofactor(H) @ line_through(*first)
     off = jnp.abs(jax.vmap(line_point_distance, in_axes=(None, 0))(line, second)).max()
     angle = lambda s: jnp.arctan2(s[1, 1] - s[0, 1], s[1, 0] - s[0, 0])
     turn = jnp.abs(wrap(angle(moved) - angle(second)))
-    same = ahead & (turn < rules.turn_gate) & (overlap(moved, second) > 0)
+    same = ahead & (turn < config.turn_gate) & (overlap(moved, second) > 0)
     return jnp.where(same, off, jnp.inf)
 
 
 @jax.jit
 def path(motion: SE2) -> SE2:
-    """Poses [T] after motions [T], the first of which does not count."""
+    """Poses [T] after motions [T]; the first motion is not used."""
 
-    def step(T, moved):
+    def step(T: SE2, moved: SE2) -> tuple[SE2, SE2]:
         T = T @ moved
         return T, T
 
@@ -116,45 +129,46 @@ def path(motion: SE2) -> SE2:
 
 
 def relate(
-    rules: TrackConfig,
+    config: TrackConfig,
     log: Observation,
     track: Int[np.ndarray, "T M"],
     height: float,
     capacity: int,
-) -> tuple[Pairs, Int[Array, "N"]]:
+) -> tuple[SegmentPairs, Int[Array, "N"]]:
     """Pairs of one line's views: the first with the last, the second with the last but one, ...
 
-    So every segment is used once, the errors of a line's pairs are independent, and all of them
-    together say of a motion what all the views say. What is followed for longer than `longest` is
-    cut into parts.
+    So every segment is used once and the errors of a line's pairs are independent. A line that is
+    followed for longer than `max_baseline` is cut into parts.
 
     **Arguments:**
     - `height`: of the camera, metres, roughly.
     - `capacity`: N; if there are more pairs, they are thinned out evenly.
 
-    **Returns:** pairs with unit sigmas, those of one stretch of the way a cluster; and the number
-    of each pair's line, from 0 to N - 1, and -1 where there is none.
+    **Returns:** pairs with unit sigmas, those of one stretch of the path in one cluster; and the
+    number of each pair's line, from 0 to N - 1, and -1 where there is none.
     """
     endpoints = np.asarray(log.segments_image.endpoints, float)
     poses = jax.device_get(path(log.motion))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses.xy, axis=0), axis=1))])
-    way /= height
+    travelled = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(poses.xy, axis=0), axis=1))]
+    )
+    travelled /= height
     t, m = np.nonzero(track >= 0)
     order = np.argsort(track[t, m], kind="stable")
     t, m = t[order], m[order]
     begins = np.flatnonzero(np.diff(track[t, m], prepend=-1))
     chosen = []
     for begin, end in zip(begins, [*begins[1:], len(t)], strict=True):
-        length = way[t[end - 1]] - way[t[begin]]
-        if end - begin < rules.min_views or length < rules.baseline:
+        length = travelled[t[end - 1]] - travelled[t[begin]]
+        if end - begin < config.min_views or length < config.min_baseline:
             continue
-        parts = int(np.ceil(length / rules.longest))
-        cut = ((way[t[begin:end]] - way[t[begin]]) / length * parts).astype(int)
+        parts = int(np.ceil(length / config.max_baseline))
+        cut = ((travelled[t[begin:end]] - travelled[t[begin]]) / length * parts).astype(int)
         edges = begin + np.searchsorted(np.minimum(cut, parts - 1), np.arange(parts + 1))
         for low, high in itertools.pairwise(edges):
             a = np.arange(low, (low + high) // 2)
             b = high - 1 - (a - low)
-            far = way[t[b]] - way[t[a]] >= rules.baseline
+            far = travelled[t[b]] - travelled[t[a]] >= config.min_baseline
             chosen.append(np.stack([a, b], axis=1)[far])
     chosen = np.concatenate(chosen) if chosen else np.zeros((0, 2), int)
     if len(chosen) > capacity:
@@ -162,23 +176,23 @@ def relate(
     a, b = chosen.T
     line = np.unique(track[t[a], m[a]], return_inverse=True)[1]
 
-    def pad(rows, fill=0):
+    def pad(rows: np.ndarray, fill: int = 0) -> Array:
         empty = np.full((capacity - len(chosen), *rows.shape[1:]), fill, rows.dtype)
         return jnp.asarray(np.concatenate([rows, empty]))
 
     at = lambda i: SE2(jnp.asarray(poses.xy[t[i]], float), jnp.asarray(poses.yaw[t[i]], float))
-    pairs = Pairs(
+    pairs = SegmentPairs(
         first=pad(endpoints[t[a], m[a]]),
         second=pad(endpoints[t[b], m[b]]),
         T_first_second=jax.tree.map(lambda x: pad(np.asarray(x)), at(a).between(at(b))),
         valid=jnp.arange(capacity) < len(chosen),
         sigma=jnp.ones((capacity, 4)),
-        cluster=pad(_stretches(way[t[a]], way[-1], rules.longest)),
+        cluster=pad(_stretches(travelled[t[a]], travelled[-1], config.max_baseline)),
     )
     return pairs, pad(line, -1)
 
 
 def _stretches(at: Float[np.ndarray, "N"], whole: float, length: float) -> Int[np.ndarray, "N"]:
-    """Which stretch of the way each place is in: `length` long, and ten at least."""
+    """Which stretch of the path each place is in: `length` long, and at least ten stretches."""
     length = max(min(length, whole / 10), 1e-9)
     return np.unique((at / length).astype(int), return_inverse=True)[1]

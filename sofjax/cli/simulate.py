@@ -12,7 +12,7 @@ from sofjax.io.numbers import decimal
 if TYPE_CHECKING:
     import numpy as np
 
-    from sofjax.simulation import Imaging, Rig
+    from sofjax.simulation import Imaging, RobotSetup
 
 
 def run(args: argparse.Namespace) -> int:
@@ -23,34 +23,33 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--images is {args.images}; a drive needs 2 at least")
     from tqdm import tqdm
 
-    from sofjax.simulation import make_world, record, take_ride
+    from sofjax.simulation import make_world, record, simulate_run
 
     world = make_world(args.world, args.seed)
     if args.way is not None:
-        world = dataclasses.replace(world, way=_way(args.way))
-    rig, imaging = choose_rig(args), _imaging(args)
-    imaging.check()
-    ride = take_ride(world, rig, args.seed, args.images)
+        world = dataclasses.replace(world, waypoints=_way(args.way))
+    setup, imaging = choose_setup(args), _imaging(args)
+    simulated = simulate_run(world, setup, args.seed, args.images)
 
     def progress(frames: Iterable) -> Iterable:
         return tqdm(frames, desc=args.out.name, unit=" images", disable=None)
 
-    record(args.out, world, rig, ride, imaging, args.seed, progress)
-    path, seconds = ride.truth.travelled[-1], ride.truth.stamps[-1]
-    print(f"{args.out}: {len(ride.truth.stamps)} images, {path:.1f} m in {seconds:.1f} s")
+    record(args.out, world, setup, simulated, imaging, args.seed, progress)
+    path, seconds = simulated.truth.travelled[-1], simulated.truth.stamps[-1]
+    print(f"{args.out}: {len(simulated.truth.stamps)} images, {path:.1f} m in {seconds:.1f} s")
     return 0
 
 
-def choose_rig(args: argparse.Namespace) -> "Rig":
+def choose_setup(args: argparse.Namespace) -> "RobotSetup":
     """The robot that the options ask for: the paper's, or in a random world a random one."""
     import equinox as eqx
     import jax.numpy as jnp
     import numpy as np
 
-    from sofjax.simulation import Rig, random_rig, webcam
+    from sofjax.simulation import RobotSetup, random_setup, webcam
 
-    rig = random_rig(args.seed) if args.world == "random" else Rig()
-    mount = rig.camera_file.mount
+    setup = random_setup(args.seed) if args.world == "random" else RobotSetup()
+    mount = setup.camera_file.mount
     for name in ("height", "pitch", "roll", "yaw", "x", "y"):
         value = getattr(args, name)
         if value is not None:
@@ -61,13 +60,13 @@ def choose_rig(args: argparse.Namespace) -> "Rig":
                 lambda m, name=name: getattr(m, name), mount, jnp.asarray(metric, float)
             )
     width, height = _size(args.size)
-    usual = float(rig.camera_file.camera.K[0, 0]) * width / 320
+    usual = float(setup.camera_file.camera.K[0, 0]) * width / 320
     focal = usual if args.focal is None else args.focal
     if not 0.2 * width <= focal <= 20 * width:
         raise InputError(
             f"--focal is {focal:g} px; for {width} pixels it must be {0.2 * width:g} or more"
         )
-    distortion = rig.camera_file.distortion
+    distortion = setup.camera_file.distortion
     if args.distortion is not None:
         distortion = args.distortion
         if len(distortion) not in (4, 5) or not np.isfinite(distortion).all():
@@ -78,10 +77,10 @@ def choose_rig(args: argparse.Namespace) -> "Rig":
     }
     driven = {"speed": args.speed, "jitter": args.jitter}
     return dataclasses.replace(
-        rig,
+        setup,
         camera_file=webcam(mount, focal, width, height, distortion),
-        driver=dataclasses.replace(rig.driver, **_chosen(driven)),
-        odometer=dataclasses.replace(rig.odometer, **_odometer(args.odometer)),
+        driver=dataclasses.replace(setup.driver, **_chosen(driven)),
+        odometer=dataclasses.replace(setup.odometer, **_odometer(args.odometer)),
         **_chosen(given),
     )
 

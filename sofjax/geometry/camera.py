@@ -41,6 +41,10 @@ class Mount(eqx.Module):
         """A mount from plain numbers, metres and radians."""
         return Mount(*(jnp.asarray(value, float) for value in (x, y, height, pitch, roll, yaw)))
 
+    def tilted(self, pitch: Float[Array, ""], roll: Float[Array, ""]) -> "Mount":
+        """This mount with `pitch` and `roll` added to its own, radians."""
+        return Mount(self.x, self.y, self.height, self.pitch + pitch, self.roll + roll, self.yaw)
+
     @property
     def T_robot_nadir(self) -> SE2:
         """The nadir: the floor point under the optical centre, with the axes of the robot."""

@@ -77,7 +77,7 @@ def alignment(a: PolarLine, b: PolarLine) -> Float[Array, "*batch"]:
     return _side(jnp.round((a.theta - b.theta) / jnp.pi))
 
 
-def _side(half_turns):
+def _side(half_turns: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """1 for even, -1 for odd; `jnp.remainder` would be called number by number."""
     return 1 - 2 * (half_turns - 2 * jnp.floor(half_turns / 2))
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import SupportsFloat, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,8 @@ from sofjax.geometry import Camera, Mount
 from sofjax.io.camera_forms import camera_fields, lens, mapping, matrix, number, size
 from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.io.text import write_atomically
+
+Number = TypeVar("Number", bound=SupportsFloat)
 
 ANGLES = ("pitch", "roll", "yaw")
 MOUNT_FIELDS = ("x", "y", "height", *ANGLES)
@@ -81,7 +84,7 @@ def write_intrinsics(
     distortion_model: str,
     distortion: np.ndarray,
     name: str,
-    mount: Mapping[str, object],
+    mount: Mapping[str, SupportsFloat],
     notes: Sequence[str] = (),
 ) -> None:
     """Write a camera file of whose mount only some fields may be known.
@@ -220,13 +223,13 @@ def _mount_numbers(where: str, given: Mapping) -> dict[str, float]:
     return mount | _canonical({key: mount[key] for key in ANGLES if key in mount})
 
 
-def _canonical(angles: Mapping[str, object]) -> dict[str, object]:
+def _canonical(angles: Mapping[str, Number]) -> dict[str, Number | float]:
     """The same tilt with the pitch in [-pi/2, pi/2], and roll and yaw in (-pi, pi], radians.
 
     A pitch that is over its limit by no more than `ROUNDING` is taken for the limit. An angle that
     is within its limits stays the number that it is.
     """
-    turned = {key: float(value) for key, value in angles.items()}
+    turned: dict[str, float] = {key: float(value) for key, value in angles.items()}
     if "pitch" in turned:
         pitch = turned["pitch"] = _wrapped(turned["pitch"])
         if abs(pitch) > math.pi / 2 + ROUNDING:  # over the vertical: the other way, upside down

@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -63,10 +64,11 @@ def camera_fields(path: Path) -> Mapping:
 
 def size(path: Path, fields: Mapping) -> tuple[int, int]:
     """Width and height, pixels."""
-    pairs = named(fields, ("resolution",))
-    for key, pair in pairs.items():
+    pairs: dict[str, list] = {}
+    for key, pair in named(fields, ("resolution",)).items():
         if not (isinstance(pair, list) and len(pair) == 2):
             raise InputError(f"{path}: '{key}' is {quoted(pair)}; it must be [width, height]")
+        pairs[key] = pair
     sides = []
     for i, side in enumerate(("width", "height")):
         given = named(fields, (f"image_{side}", side)) | {k: pair[i] for k, pair in pairs.items()}
@@ -178,7 +180,7 @@ def _refuse_slip(path: Path, name: str, fields: Mapping) -> None:
         raise InputError(f"{path}: the field '{name}' is missing; did you mean {quoted(close)}?")
 
 
-def _agreed(path: Path, given: Mapping, name: str, fields: Mapping):
+def _agreed(path: Path, given: Mapping, name: str, fields: Mapping) -> Any:
     """The one value of what is given by several names; `name` is what to ask for if by none."""
     if not given:
         _refuse_slip(path, name, fields)
@@ -200,7 +202,7 @@ def _pixels(path: Path, key: str, value: object) -> int:
 def _model(path: Path, key: str, value: object) -> str:
     """A key of `SIZES`, or none."""
     word = "" if value is None else value
-    word = word.strip().lower() if isinstance(word, str) else None
+    word = word.strip().lower() if isinstance(word, str) else "no word"
     model = OTHER_NAMES.get(word, word)
     if model not in SIZES and model != "none":
         raise InputError(

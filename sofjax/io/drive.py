@@ -238,7 +238,7 @@ def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
 class _Folder:
     """What lies in a drive's folder, each folder looked at once; links must not lead out of it."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path) -> None:
         self._path = path
         self._root = path.resolve()
         self._inside: dict[str, dict[str, os.DirEntry]] = {}

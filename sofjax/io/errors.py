@@ -13,7 +13,7 @@ class InputError(ValueError):
     It is one line: characters that cannot be printed are escaped.
     """
 
-    def __init__(self, sentence: str):
+    def __init__(self, sentence: str) -> None:
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in sentence))
 
 

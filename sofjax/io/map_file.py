@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ def write_map(
     """
     features = []
     for i, endpoints in enumerate(np.asarray(endpoints_world, float)):
-        properties = {"seen": int(seen[i])}
+        properties: dict[str, int | float] = {"seen": int(seen[i])}
         if height is not None and math.isfinite(height[i]):
             properties["height"] = round(float(height[i]), 4)
         line = {"type": "LineString", "coordinates": np.round(endpoints, 5).tolist()}
@@ -73,7 +74,7 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(endpoints, float).reshape(-1, 2, 2), np.array(seen, int)
 
 
-def _point(where: str, x: object, y: object) -> tuple[int | float, int | float]:
+def _point(where: str, x: Any, y: Any) -> tuple[int | float, int | float]:
     for value in (x, y):
         if type(value) not in (int, float):
             raise InputError(f"{where}: a coordinate is {quoted(value)}; it must be metres")

@@ -218,7 +218,7 @@ def _too_far(
 def _restarts(trajectory: Trajectory) -> np.ndarray:
     """[n - 1] bool, steps that end where odometers begin and come from far away."""
     pose = np.column_stack([trajectory.xy, np.angle(np.exp(1j * trajectory.yaw))])
-    at_origin = (np.abs(pose) < ZERO).all(1)
+    at_origin = np.all(np.abs(pose) < ZERO, axis=1)
     _, way, _ = between_rows(trajectory)
     return at_origin[1:] & ~at_origin[:-1] & (way > FROM)
 

@@ -184,7 +184,7 @@ class TrajectoryWriter:
     the file ends with the row before, and the `OSError` names the file.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path) -> None:
         self._path, self._size = path, 0
         self._file: FileIO | None = None
 

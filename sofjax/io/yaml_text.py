@@ -1,7 +1,8 @@
 """YAML that cannot run code, nor unfold without end."""
 
 import re
-from typing import ClassVar
+from collections.abc import Hashable
+from typing import Any, ClassVar
 
 import yaml
 
@@ -20,7 +21,7 @@ class _Loader(yaml.SafeLoader):
     depth = 0
     yaml_implicit_resolvers: ClassVar[dict] = {}  # none of YAML 1.1; those below
 
-    def compose_node(self, parent, index):
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent) or self.peek_event().anchor is not None:
             mark = self.peek_event().start_mark
             raise yaml.MarkedYAMLError(
@@ -41,7 +42,7 @@ class _Loader(yaml.SafeLoader):
         self.depth -= 1
         return node
 
-    def construct_mapping(self, node, deep=False):
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         mapping = super().construct_mapping(node, deep)
         if len(mapping) < len(node.value):
             problem = "a name is given twice"
@@ -73,7 +74,7 @@ def parse_yaml(text: str, where: str) -> object:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""
-        raise InputError(f"{where}{line}: not plain YAML: {plain(error.problem)}") from None
+        raise InputError(f"{where}{line}: not plain YAML: {plain(str(error.problem))}") from None
     except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         raise InputError(f"{where}: not plain YAML: {plain(error)}") from None
     documents = [data for data in documents if data is not None]

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sofjax.calibration import TURNS, UNKNOWNS, DriveFit, DriveFitConfig, FitConfig, fit_drive
-from sofjax.calibration.assessment import estimates
-from sofjax.calibration.fit import doubts
+from sofjax.calibration.assessment import doubts, estimates
 from sofjax.calibration.joint import fit_jointly
 from sofjax.extraction.observation import Observation
 from sofjax.geometry import Camera, Mount
@@ -114,7 +113,8 @@ def calibrate_drive(
     with jax.enable_x64(True):
         camera, mount, log = _in_float64((drive.camera_file.camera, drive.camera_file.mount, log))
         found = fit_drive(camera, mount, log, config)
-        usable, why = found.verdict(config)
+        assessment = found.verdict(config)
+        usable = assessment.usable
         fitted, covariance = jax.device_get(found.fit.mount), found.covariance
         odometer = np.asarray(found.fit.odometer)
         if usable and joint:
@@ -132,7 +132,9 @@ def calibrate_drive(
         drive=drive,
         camera_file=dataclasses.replace(drive.camera_file, mount=type(fitted)(*fields)),
         verdict=verdict if usable else FitVerdict.NOT_USABLE,
-        sentence=_accuracy(fitted, covariance) + f"; {doubt}" * bool(doubt) if usable else why,
+        sentence=_accuracy(fitted, covariance) + f"; {doubt}" * bool(doubt)
+        if usable
+        else assessment.sentence,
         evidence=evidence,
         estimates=estimates(fitted, odometer, covariance, config.fit.free),
         residual_px=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.nan,

@@ -46,13 +46,15 @@ def draw_result(path: Path, result: DriveResult) -> bool:
     viewer.draw_map(
         path,
         title,
-        robot=to_truth.apply(estimate.xy),
-        odometry=to_truth.apply(odometry),
-        segments=to_truth.apply(result.segments),
-        true_robot=drive.groundtruth.xy if motion and drive.groundtruth else None,
-        true_segments=drive.floor_segments if motion else None,
-        online=to_truth.apply(run_log.trajectory.xy) if closed else None,
-        ellipses=_ellipses(closed, to_truth) if closed else None,
+        viewer.MapFigure(
+            robot=to_truth.apply(estimate.xy),
+            odometry=to_truth.apply(odometry),
+            segments=to_truth.apply(result.segments),
+            true_robot=drive.groundtruth.xy if motion and drive.groundtruth else None,
+            true_segments=drive.floor_segments if motion else None,
+            online=to_truth.apply(run_log.trajectory.xy) if closed else None,
+            ellipses=_ellipses(closed, to_truth) if closed else None,
+        ),
     )
     return True
 

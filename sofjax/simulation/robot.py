@@ -1,4 +1,4 @@
-"""A robot that a hand drives along a way, and the odometer that reads its motion wrongly."""
+"""A robot that is steered by hand along waypoints, and its odometer with errors."""
 
 import itertools
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sofjax.geometry.se2 import SE2
 from sofjax.io.trajectory import Trajectory
-from sofjax.simulation.world.plan import distance_to_way
+from sofjax.simulation.world.plan import distance_to_path
 
 STEP = 0.02  # seconds between the poses of a driven path
 
@@ -25,19 +25,19 @@ class Driver:
     turn_rate: float = 0.8  # radians per second at most
     acceleration: float = 0.5  # metres per second squared
     jitter: float = 0.05  # radians per second, of the hand that steers
-    look_ahead: float = 0.8  # metres, the point on the way that is steered at
+    look_ahead: float = 0.8  # metres, from the robot to the point of the path it steers at
 
 
 def drive_along(
-    way: Float[np.ndarray, "points 2"], driver: Driver, rng: np.random.Generator
+    waypoints: Float[np.ndarray, "points 2"], driver: Driver, rng: np.random.Generator
 ) -> Trajectory:
-    """Drive along a way: slower in bends, and turning on the spot where the way turns back.
+    """Drive along waypoints: slower in bends, turning on the spot where the path turns back.
 
     **Returns:** true poses every `STEP` seconds from 0, from rest to rest.
     """
-    at, yaw, hand = way[0].astype(float), _heading(way[1] - way[0]), 0.0
+    at, yaw, hand = waypoints[0].astype(float), _heading(waypoints[1] - waypoints[0]), 0.0
     poses = [(*at, yaw)]
-    for section in _sections(way):
+    for section in _sections(waypoints):
         arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(section, axis=0), axis=1)))
         speed = turn = progress = 0.0
         give_up = len(poses) + int((60 + 10 * arc[-1] / driver.speed) / STEP)
@@ -67,25 +67,25 @@ def _heading(vector: np.ndarray) -> float:
     return float(np.arctan2(vector[1], vector[0]))
 
 
-def _sections(way: np.ndarray) -> list[np.ndarray]:
-    """A way cut where it turns back on itself by more than 120 degrees."""
-    d = np.diff(way, axis=0)
+def _sections(waypoints: np.ndarray) -> list[np.ndarray]:
+    """Waypoints, cut where the path turns back by more than 120 degrees."""
+    d = np.diff(waypoints, axis=0)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     backs = np.flatnonzero((d[1:] * d[:-1]).sum(1) < -0.5) + 1
-    ends = [0, *backs, len(way) - 1]
-    return [way[a : b + 1] for a, b in itertools.pairwise(ends)]
+    ends = [0, *backs, len(waypoints) - 1]
+    return [waypoints[a : b + 1] for a, b in itertools.pairwise(ends)]
 
 
-def _point(way: np.ndarray, arc: np.ndarray, s: float) -> np.ndarray:
+def _point(waypoints: np.ndarray, arc: np.ndarray, s: float) -> np.ndarray:
     """The point at arc length `s`, on the prolonged last leg beyond the end."""
-    i = min(int(np.searchsorted(arc, s, side="right")) - 1, len(way) - 2)
-    return way[i] + (s - arc[i]) / (arc[i + 1] - arc[i]) * (way[i + 1] - way[i])
+    i = min(int(np.searchsorted(arc, s, side="right")) - 1, len(waypoints) - 2)
+    return waypoints[i] + (s - arc[i]) / (arc[i + 1] - arc[i]) * (waypoints[i + 1] - waypoints[i])
 
 
-def _advance(way: np.ndarray, arc: np.ndarray, at: np.ndarray, progress: float) -> float:
-    """How far along the way the robot is: never back, and never more than a step ahead."""
+def _advance(waypoints: np.ndarray, arc: np.ndarray, at: np.ndarray, progress: float) -> float:
+    """How far along the path the robot is, metres: never back, and never more than a step ahead."""
     ahead = np.linspace(progress, min(progress + 0.1, arc[-1]), 11)
-    x, y = np.interp(ahead, arc, way[:, 0]), np.interp(ahead, arc, way[:, 1])
+    x, y = np.interp(ahead, arc, waypoints[:, 0]), np.interp(ahead, arc, waypoints[:, 1])
     return float(ahead[((x - at[0]) ** 2 + (y - at[1]) ** 2).argmin()])
 
 
@@ -168,4 +168,4 @@ def read_path(odometer: Odometer, truth: Trajectory, key: PRNGKeyArray) -> Traje
 
 def clearance(walls: Float[np.ndarray, "walls 2 2"], truth: Trajectory) -> float:
     """Least distance of a path from the walls, metres."""
-    return float(min(distance_to_way(wall, truth.xy).min() for wall in walls))
+    return float(min(distance_to_path(wall, truth.xy).min() for wall in walls))

@@ -1,4 +1,4 @@
-"""A ride: a robot driven through a world, what was true of it and what its odometer read."""
+"""A simulated run: a robot driven through a world, its true motion and its odometer."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from sofjax.io.camera_file import CameraFile, horizon_image
 from sofjax.io.errors import InputError
 from sofjax.io.trajectory import Trajectory
 from sofjax.simulation.robot import Driver, Odometer, drive_along, increments, read_path
-from sofjax.simulation.world.catalogue import check_way
+from sofjax.simulation.world.catalogue import check_waypoints
 from sofjax.simulation.world.plan import inside
 from sofjax.simulation.world.types import World
 
@@ -36,7 +36,7 @@ def webcam(
 
 
 @dataclass(frozen=True)
-class Rig:
+class RobotSetup:
     """A robot with its camera, its odometer and its driver."""
 
     camera_file: CameraFile = field(default_factory=webcam)
@@ -47,8 +47,42 @@ class Rig:
     dropped: float = 0.01  # share of the readings that are lost
     vibration: float = math.radians(0.1)  # radians, of the mount's pitch and roll at full speed
 
+    def __post_init__(self) -> None:
+        """Refuse numbers that cannot be, in a sentence."""
+        odometer, driver = self.odometer, self.driver
+        for name, value in (
+            ("vibration in degrees", math.degrees(self.vibration)),
+            ("share of dropped readings", self.dropped),
+            ("noise of the odometer's distance", odometer.distance_noise),
+            ("noise of the odometer's heading", odometer.heading_noise),
+            ("noise of the odometer's turns", odometer.turn_noise),
+            ("number of slips per metre", odometer.slip),
+            ("jitter of the steering", driver.jitter),
+            ("scale of the odometer's distance", odometer.distance),
+            ("scale of the odometer's left turns", odometer.left),
+            ("scale of the odometer's right turns", odometer.right),
+        ):
+            if not 0 <= float(value) < math.inf:
+                raise InputError(f"the {name} is {float(value):g}; it must be 0 or more")
+        if self.dropped > 0.9:
+            raise InputError(
+                f"of the readings a share of {self.dropped:g} is dropped; at most 0.9 may be"
+            )
+        for name, value, unit in (
+            ("speed", driver.speed, "metres a second"),
+            ("turn rate", driver.turn_rate, "radians a second"),
+            ("image rate", self.image_rate, "images a second"),
+            ("odometry rate", self.odometry_rate, "readings a second"),
+        ):
+            if not 0 < value < math.inf:
+                raise InputError(f"the {name} is {value:g}; it must be more than 0 {unit}")
+        if driver.speed > 2:
+            raise InputError(
+                f"at {driver.speed:g} m/s a robot cannot take these bends; at most 2 may be"
+            )
 
-def random_rig(seed: int) -> Rig:
+
+def random_setup(seed: int) -> RobotSetup:
     """A robot unlike others: its camera, the camera's place, and the errors of its odometer."""
     rng = np.random.default_rng([seed, 37])
     mount = Mount.create(
@@ -60,23 +94,24 @@ def random_rig(seed: int) -> Rig:
         yaw=math.radians(rng.normal(0, 1.5)),
     )
     camera_file = webcam(mount, focal=float(rng.uniform(240, 330)))
+    number = lambda value: jnp.asarray(value, float)
     odometer = Odometer(
-        distance=rng.normal(1, 0.012),
-        left=rng.normal(1.02, 0.035),
-        right=rng.normal(1.02, 0.035),
-        bend=rng.normal(0, 0.003),
-        distance_noise=rng.uniform(0.001, 0.008),
-        heading_noise=rng.uniform(0.001, 0.006),
-        turn_noise=rng.uniform(0.003, 0.02),
-        slip=rng.uniform(0, 0.05),
+        distance=number(rng.normal(1, 0.012)),
+        left=number(rng.normal(1.02, 0.035)),
+        right=number(rng.normal(1.02, 0.035)),
+        bend=number(rng.normal(0, 0.003)),
+        distance_noise=number(rng.uniform(0.001, 0.008)),
+        heading_noise=number(rng.uniform(0.001, 0.006)),
+        turn_noise=number(rng.uniform(0.003, 0.02)),
+        slip=number(rng.uniform(0, 0.05)),
     )
     driver = Driver(speed=float(rng.uniform(0.4, 0.9)), jitter=float(rng.uniform(0.02, 0.1)))
-    return Rig(camera_file, driver, odometer)
+    return RobotSetup(camera_file, driver, odometer)
 
 
 @dataclass(frozen=True)
-class Ride:
-    """What happened."""
+class SimulatedRun:
+    """A robot driven through a world: the truth, and what its odometer read."""
 
     truth: Trajectory  # at the images
     turn_rate: np.ndarray  # [T] radians per second, at the images
@@ -97,36 +132,40 @@ class Ride:
         return np.asarray(R_world_camera, float), np.asarray(C, float)
 
 
-def take_ride(world: World, rig: Rig, seed: int = 0, most_images: int | None = None) -> Ride:
-    """Drive a robot along a world's way.
+def simulate_run(
+    world: World, setup: RobotSetup, seed: int = 0, max_images: int | None = None
+) -> SimulatedRun:
+    """Drive a robot along a world's waypoints.
 
-    **Raises:** `InputError` for a way through a wall, and for a rig that cannot be.
+    **Raises:** `InputError` for waypoints that lead through a wall, and for an impossible setup.
     """
-    check_rig(world, rig)
-    check_way(world.corridors, world.way)
+    check_setup(world, setup)
+    check_waypoints(world.corridors, world.waypoints)
     rng = np.random.default_rng([seed, 41])
-    path = drive_along(world.way, rig.driver, rng)
-    stamps = np.arange(0, path.stamps[-1], 1 / rig.image_rate)[:most_images]
+    path = drive_along(world.waypoints, setup.driver, rng)
+    stamps = np.arange(0, path.stamps[-1], 1 / setup.image_rate)[:max_images]
     truth = path.at(stamps)
-    read_at = path.at(np.arange(0, stamps[-1] + 1 / rig.odometry_rate, 1 / rig.odometry_rate))
-    odometry = read_path(rig.odometer, read_at, jax.random.key(seed))
-    kept = rng.random(len(odometry.stamps)) >= rig.dropped
+    read_at = path.at(np.arange(0, stamps[-1] + 1 / setup.odometry_rate, 1 / setup.odometry_rate))
+    odometry = read_path(setup.odometer, read_at, jax.random.key(seed))
+    kept = rng.random(len(odometry.stamps)) >= setup.dropped
     kept[[0, -1]] = True
     odometry = Trajectory(odometry.stamps[kept], odometry.xy[kept], odometry.yaw[kept])
     before, after = path.at(stamps - 0.02), path.at(stamps + 0.02)
     speed = np.linalg.norm(after.xy - before.xy, axis=-1) / 0.04
     shake = (
-        rig.vibration * (speed / rig.driver.speed)[:, None] * rng.standard_normal((len(stamps), 2))
+        setup.vibration
+        * (speed / setup.driver.speed)[:, None]
+        * rng.standard_normal((len(stamps), 2))
     )
     turn_rate = (after.yaw - before.yaw) / 0.04
-    ride = Ride(truth, turn_rate, odometry, _shaken(rig.camera_file.mount, shake))
-    C = ride.camera_poses()[1]
+    simulated = SimulatedRun(truth, turn_rate, odometry, _shaken(setup.camera_file.mount, shake))
+    C = simulated.camera_poses()[1]
     for outside in C[~inside(world.corridors, C[:, :2])][:1]:
         raise InputError(
             f"the camera goes through a wall at ({outside[0]:.2f}, {outside[1]:.2f}); its place on "
             "the robot must be nearer to the middle"
         )
-    return ride
+    return simulated
 
 
 def _shaken(mount: Mount, shake: np.ndarray) -> Mount:
@@ -135,15 +174,14 @@ def _shaken(mount: Mount, shake: np.ndarray) -> Mount:
     @jax.jit
     @jax.vmap
     def one(moved: Array) -> Mount:
-        pitch, roll = mount.pitch + moved[0], mount.roll + moved[1]
-        return Mount(mount.x, mount.y, mount.height, pitch, roll, mount.yaw)
+        return mount.tilted(moved[0], moved[1])
 
     return one(jnp.asarray(shake, mount.pitch.dtype))
 
 
-def check_rig(world: World, rig: Rig) -> None:
-    """Refuse a robot that cannot be, in a sentence."""
-    camera, mount = rig.camera_file.camera, rig.camera_file.mount
+def check_setup(world: World, setup: RobotSetup) -> None:
+    """Refuse a camera that cannot see this world's floor, in a sentence."""
+    camera, mount = setup.camera_file.camera, setup.camera_file.mount
     height = float(mount.height)
     if not 0 < height < world.ceiling:
         where = "in or under the floor" if height <= 0 else "above the ceiling"
@@ -158,37 +196,6 @@ def check_rig(world: World, rig: Rig) -> None:
         raise InputError(
             f"with a pitch of {math.degrees(mount.pitch):g} degrees the camera sees no floor; "
             "pitch > 0 looks down"
-        )
-    odometer = rig.odometer
-    for name, value in (
-        ("vibration in degrees", math.degrees(rig.vibration)),
-        ("share of dropped readings", rig.dropped),
-        ("noise of the odometer's distance", odometer.distance_noise),
-        ("noise of the odometer's heading", odometer.heading_noise),
-        ("noise of the odometer's turns", odometer.turn_noise),
-        ("number of slips per metre", odometer.slip),
-        ("wobble", rig.driver.jitter),
-        ("scale of the odometer's distance", odometer.distance),
-        ("scale of the odometer's left turns", odometer.left),
-        ("scale of the odometer's right turns", odometer.right),
-    ):
-        if not 0 <= float(value) < math.inf:
-            raise InputError(f"the {name} is {float(value):g}; it must be 0 or more")
-    if rig.dropped > 0.9:
-        raise InputError(
-            f"of the readings a share of {rig.dropped:g} is dropped; at most 0.9 may be"
-        )
-    for name, value, unit in (
-        ("speed", rig.driver.speed, "metres a second"),
-        ("turn rate", rig.driver.turn_rate, "radians a second"),
-        ("image rate", rig.image_rate, "images a second"),
-        ("odometry rate", rig.odometry_rate, "readings a second"),
-    ):
-        if not 0 < value < math.inf:
-            raise InputError(f"the {name} is {value:g}; it must be more than 0 {unit}")
-    if rig.driver.speed > 2:
-        raise InputError(
-            f"at {rig.driver.speed:g} m/s a robot cannot take these bends; at most 2 may be"
         )
 
 

@@ -1,10 +1,10 @@
-"""What a fit of the mount leaves, and the floor as the old and the new mount have it."""
+"""Residuals of a fit of the mount, and the floor as projected by the old and the new mount."""
 
 from pathlib import Path
 
 import numpy as np
 
-from sofjax.viewer.style import new_figure, save
+from sofjax.viewer.style import hide_spines, new_figure, save
 
 OLD, NEW = "#d4447c", "#1f4e9c"
 
@@ -21,31 +21,30 @@ def draw_mount(
 
     **Arguments:**
     - `before`, `after`: [N, 4] distances in pixels by the old and the new mount.
-    - `floors`: for the old and the new mount the floor from above, grey, out of two images.
-    - `extent`: of these, x from, x to, y from, y to, metres.
+    - `floors`: for the old and the new mount the floor from above, grey, from two images.
+    - `extent`: the smallest and largest x, then y, of these, metres.
     """
-    sheet, (bars, *views) = new_figure((14.0, 5.2), 1, 3)
-    reach = max(4.0, float(np.quantile(np.abs(after), 0.99)) * 1.5)
-    bins = np.linspace(-reach, reach, 61)
+    figure, (bars, *views) = new_figure((14.0, 5.2), 1, 3)
+    limit = max(4.0, float(np.quantile(np.abs(after), 0.99)) * 1.5)
+    bins = np.linspace(-limit, limit, 61).tolist()
     for values, color, name in ((before, OLD, "old mount"), (after, NEW, "new mount")):
         rms = float(np.sqrt(np.mean(values**2)))
-        inside = np.clip(values.ravel(), -reach, reach)
+        inside = np.clip(values.ravel(), -limit, limit)
         bars.hist(inside, bins, color=color, alpha=0.6, label=f"{name}: {rms:.2f} px")
     bars.legend(frameon=False, fontsize=9, loc="upper left")
     bars.set_title(f"ends from the other's line, {len(after)} pairs", loc="left", fontsize=9)
     bars.set_xlabel("pixels")
     bars.set_yticks([])
-    for side in ("top", "right", "left"):
-        bars.spines[side].set_visible(False)
+    hide_spines(bars, "top", "right", "left")
 
     x0, x1, y0, y1 = extent
     for axes, both, name in zip(views, floors, ("old", "new"), strict=True):
         if len(both) == 2:  # red and cyan: grey where the two agree
             picture = np.stack([both[0], both[1], both[1]], axis=-1)
-            picture[(picture == 0).any(axis=-1)] = 0  # where one of them does not reach
+            picture[(picture == 0).any(axis=-1)] = 0  # outside of one of them
             axes.imshow(picture, extent=(y1, y0, x0, x1), aspect="equal")
         axes.set_title(f"the floor from two images by the {name} mount", loc="left", fontsize=9)
         axes.set_xlabel("y, metres")
         axes.set_ylabel("x, metres; coloured where the two do not meet")
-    sheet.suptitle(title, fontsize=10, ha="left", x=0.01)
-    save(sheet, path)
+    figure.suptitle(title, fontsize=10, ha="left", x=0.01)
+    save(figure, path)

@@ -109,16 +109,18 @@ def _chessboard(image: np.ndarray, board: Board) -> np.ndarray | None:
     gap = min(np.linalg.norm(np.diff(grid, axis=a), axis=-1).min() for a in (0, 1))
     window = int(np.clip(WINDOW * gap, 2, MAX_WINDOW))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
-    refined = cv2.cornerSubPix(image, np.float32(corners).copy(), (window, window), (-1, -1), stop)
+    refined = cv2.cornerSubPix(
+        image, np.array(corners, np.float32), (window, window), (-1, -1), stop
+    )
     return refined.reshape(-1, 2)
 
 
 def _circles(image: np.ndarray, board: Board) -> np.ndarray | None:
     """Middles [N, 2] of dark circles in the order of the board's, pixels."""
-    blobs = cv2.SimpleBlobDetector_Params()
+    blobs = cv2.SimpleBlobDetector_Params()  # pyright: ignore[reportAttributeAccessIssue]
     blobs.maxArea = image.size / (board.columns * board.rows)
     blobs.minDistBetweenBlobs = MIN_BLOB_GAP
-    detector = cv2.SimpleBlobDetector_create(blobs)
+    detector = cv2.SimpleBlobDetector_create(blobs)  # pyright: ignore[reportAttributeAccessIssue]
     grid = cv2.CALIB_CB_ASYMMETRIC_GRID if board.pattern == "acircles" else 0
     grid = grid or cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (grid, grid | cv2.CALIB_CB_CLUSTERING):
@@ -136,7 +138,7 @@ def _charuco(
     corners, ids, _, _ = _charuco_detector(board, dictionary, legacy).detectBoard(image)
     if ids is None or len(ids) < MIN_POINTS:
         return None
-    points = board.points[ids.ravel()]
+    points = board.points[np.asarray(ids, int).ravel()]
     if np.linalg.matrix_rank(points[:, :2] - points[0, :2], tol=0.5 * board.square) < 2:
         return None
     return Correspondences(points, np.asarray(corners, float).reshape(-1, 2))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -110,14 +111,15 @@ def _solve(width: int, height: int, found: list[Correspondences]) -> _Solution:
 
     It is zero too where by it the lens would turn back within the image, which no lens does.
     """
+    no_guess: Any = None  # OpenCV's stubs want a matrix here
     for flags in (0, cv2.CALIB_FIX_K3):
         try:
             error, K, distortion, R, t, sigma, _, errors = cv2.calibrateCameraExtended(
                 [seen.points for seen in found],
-                [np.float32(seen.corners) for seen in found],
+                [np.asarray(seen.corners, np.float32) for seen in found],
                 (width, height),
-                None,
-                None,
+                no_guess,
+                no_guess,
                 flags=flags,
             )
         except cv2.error:
@@ -156,7 +158,7 @@ def _view(
 ) -> BoardView:
     """A view under the final camera; where it was no part of the fit, with its own best pose."""
     camera = solution.K, solution.distortion
-    R, t = pose or cv2.solvePnP(seen.points, np.float32(seen.corners), *camera)[1:]
+    R, t = pose or cv2.solvePnP(seen.points, np.asarray(seen.corners, np.float32), *camera)[1:]
     projected = cv2.projectPoints(seen.points, R, t, *camera)[0].reshape(-1, 2)
     rotation = cv2.Rodrigues(R)[0]
     middle = rotation @ board.points.mean(0) + t.ravel()

@@ -13,7 +13,7 @@ MARGIN = 3  # pixels by which a detector's smoothing reaches over the edge of th
 class Lens:
     """The lens of a camera: maps computed once, then one lookup a pixel."""
 
-    def __init__(self, camera_file: CameraFile):
+    def __init__(self, camera_file: CameraFile) -> None:
         camera = camera_file.camera
         self.K = np.asarray(camera.K, float)
         self.distortion = camera_file.distortion
@@ -67,7 +67,7 @@ def _seen(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     valid = (inside & (x_u * y_v > x_v * y_u)).astype(np.uint8)
     if valid.all():
         return valid.astype(bool)
-    framed = cv2.copyMakeBorder(valid, *(MARGIN,) * 4, cv2.BORDER_REPLICATE)
+    framed = cv2.copyMakeBorder(valid, MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_REPLICATE)
     eroded = cv2.erode(framed, np.ones((2 * MARGIN + 1,) * 2, np.uint8))[
         MARGIN:-MARGIN, MARGIN:-MARGIN
     ]

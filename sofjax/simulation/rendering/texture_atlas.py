@@ -86,7 +86,7 @@ def paint_atlas(world: World, seed: int = 0) -> Atlas:
 class _Sheet:
     """Pictures put side by side on shelves, and the shelves over one another."""
 
-    def __init__(self, columns: int):
+    def __init__(self, columns: int) -> None:
         self._columns = columns
         self._shelf: list[np.ndarray] = []
         self._shelves: list[np.ndarray] = []
@@ -131,7 +131,7 @@ class _Sheet:
 class Light:
     """How bright the lamps make each place of the plan, 1 in the middle of a good stretch."""
 
-    def __init__(self, world: World):
+    def __init__(self, world: World) -> None:
         self._centres = (world.lamps[:, :2] + world.lamps[:, 2:]) / 2
         self._lights = world.lamp_light
         self._ceiling = world.ceiling

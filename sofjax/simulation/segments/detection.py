@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from sofjax._checks import check_fields
 from sofjax.geometry.angles import safe_divide, safe_norm
 from sofjax.geometry.camera import Camera
 from sofjax.simulation.segments.visibility import NEAREST_DEPTH, project, where_positive
@@ -27,14 +28,21 @@ class Detection(eqx.Module):
 
     noise: float = 0.25  # pixels, standard deviation of an end across the line
     shortening: float = 1.5  # pixels that an end is short of the edge's, mean size
-    missed: float = 0.1  # share of edges of good contrast that are not seen
-    least_contrast: float = 0.04  # step of brightness below which no edge is seen
-    full_contrast: float = 0.1  # ... and from which its contrast is good; between, in proportion
+    missed: float = 0.1  # share of edges of good contrast that are not detected
+    min_contrast: float = 0.04  # step of brightness below which no edge is detected
+    full_contrast: float = 0.1  # from which it is detected as well as any; linear between the two
     blur: float = 1.05  # pixels, standard deviation: lens, pixels and detector together
     broken: float = 0.25  # share of edges that come in two pieces
     false_segments: float = 2.0  # mean number an image
     shortest: float = 15.0  # pixels
     max_depth: float = 10.0  # metres
+
+    def __check_init__(self) -> None:
+        shares = ("missed", "broken")
+        sizes = ("noise", "shortening", "min_contrast", "false_segments", "shortest")
+        check_fields(
+            self, at_least_zero=(*shares, *sizes), positive=("full_contrast", "blur", "max_depth")
+        )
 
 
 LSD = Detection()
@@ -83,8 +91,12 @@ def seen_until(
 
     A line without breadth is an edge that does not fade, seen to `max_depth`.
     """
-    least = 8**0.5 * detection.blur * jax.scipy.special.erfinv(safe_divide(wanted, contrast))
-    fades = jnp.where(breadth > 0, breadth / jnp.maximum(least, 1e-6), jnp.inf)
+    needed = (
+        8**0.5
+        * detection.blur
+        * jax.scipy.special.erfinv(safe_divide(jnp.asarray(wanted), contrast))
+    )
+    fades = jnp.where(breadth > 0, breadth / jnp.maximum(needed, 1e-6), jnp.inf)
     return jnp.where(wanted < contrast, jnp.minimum(fades, detection.max_depth), 0)
 
 

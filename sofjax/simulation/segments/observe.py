@@ -117,7 +117,7 @@ def see(
     breadth = jax.vmap(breadth_in_image, in_axes=(0, 0, 0, None))(
         homogeneous, scene.edges_world, scene.width, P
     )
-    reach = seen_until(breadth, scene.contrast, detection.least_contrast, detection)
+    reach = seen_until(breadth, scene.contrast, detection.min_contrast, detection)
     part = jax.vmap(in_picture, in_axes=(0, None, 0))(homogeneous, camera, reach)
     length = jax.vmap(length_in_image)(homogeneous, part)
     candidates = min(CANDIDATES, len(scene.contrast))
@@ -132,9 +132,7 @@ def see(
     # As a detector reports them, each of the two edges of a fine line by a draw of its own
     miss_key, break_key, false_key, noise_key = jax.random.split(key, 4)
     seldom = jax.random.uniform(miss_key, (candidates, 2)) / (1 - detection.missed)
-    wanted = detection.least_contrast + seldom * (
-        detection.full_contrast - detection.least_contrast
-    )
+    wanted = detection.min_contrast + seldom * (detection.full_contrast - detection.min_contrast)
     wanted = jnp.where(seldom < 1, wanted, jnp.inf)
     reach = seen_until(breadth[:, None], scene.contrast[chosen, None], wanted, detection)
     pieces, whole = jax.vmap(break_up, in_axes=(0, 0, None))(

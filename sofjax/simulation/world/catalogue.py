@@ -6,18 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 from sofjax.io.errors import InputError, nearest, quoted
-from sofjax.simulation.world.furnishing import (
-    FLOORS,
-    Paint,
-    Plan,
-    fit_walls,
-    hang_lamps,
-    put_boxes,
-)
-from sofjax.simulation.world.plan import distance_to_way, inside, union_walls
+from sofjax.simulation.world.floors import FLOORS, Paint, Plan
+from sofjax.simulation.world.furnishing import fit_walls, hang_lamps, put_boxes
+from sofjax.simulation.world.plan import distance_to_path, inside, union_walls
 from sofjax.simulation.world.types import Look, World
 
-CLEARANCE = 0.35  # metres between the way and a wall
+CLEARANCE = 0.35  # metres between the path and a wall
 
 
 def make_world(name: str, seed: int = 0) -> World:
@@ -28,20 +22,20 @@ def make_world(name: str, seed: int = 0) -> World:
     if name not in WORLDS:
         raise InputError(f"there is no world {quoted(name)}; {nearest(name, WORLDS)}")
     rng = np.random.default_rng([seed, sorted(WORLDS).index(name)])
-    corridors, way, floor = WORLDS[name](rng)
-    return furnish(name, corridors, way, floor, rng)
+    corridors, waypoints, floor = WORLDS[name](rng)
+    return furnish(name, corridors, waypoints, floor, rng)
 
 
 def furnish(
     name: str,
     corridors: Float[np.ndarray, "n 4"],
-    way: Float[np.ndarray, "points 2"],
+    waypoints: Float[np.ndarray, "points 2"],
     floor: str,
     rng: np.random.Generator,
 ) -> World:
     """Fit out a bare plan: `floor` is one of `FLOORS`; the rest is drawn by chance."""
-    check_way(corridors, way)
-    plan = Plan(corridors, union_walls(corridors), way)
+    check_waypoints(corridors, waypoints)
+    plan = Plan(corridors, union_walls(corridors), waypoints)
     tint = rng.uniform(0.94, 1.06, 3)
     look = Look(
         floor=np.clip(rng.uniform(0.38, 0.72) * tint, 0, 1),
@@ -60,7 +54,7 @@ def furnish(
         corridors=corridors,
         walls=plan.walls,
         ceiling=float(rng.uniform(2.3, 3.0)),
-        way=way,
+        waypoints=waypoints,
         look=look,
         floor_areas=on_floor.areas(),
         floor_lines=on_floor.lines(),
@@ -73,24 +67,26 @@ def furnish(
     )
 
 
-def check_way(corridors: Float[np.ndarray, "n 4"], way: Float[np.ndarray, "points 2"]) -> None:
-    """Refuse a way that leaves the corridor or comes too near to a wall."""
-    if len(way) < 2:
-        raise InputError("a way needs two points at least")
+def check_waypoints(
+    corridors: Float[np.ndarray, "n 4"], waypoints: Float[np.ndarray, "points 2"]
+) -> None:
+    """Refuse a path that leaves the corridor or comes too near to a wall."""
+    if len(waypoints) < 2:
+        raise InputError("a path needs two waypoints at least")
     walls = union_walls(corridors)
-    for a, b in itertools.pairwise(way):
+    for a, b in itertools.pairwise(waypoints):
         steps = np.linspace(0, 1, max(2, int(np.linalg.norm(b - a) / 0.05)))
         points = a + steps[:, None] * (b - a)
         for outside in points[~inside(corridors, points)][:1]:
             raise InputError(
-                f"the way from ({a[0]:g}, {a[1]:g}) to ({b[0]:g}, {b[1]:g}) goes through a wall "
+                f"the path from ({a[0]:g}, {a[1]:g}) to ({b[0]:g}, {b[1]:g}) goes through a wall "
                 f"at ({outside[0]:.2f}, {outside[1]:.2f})"
             )
-        gaps = np.min([distance_to_way(wall, points) for wall in walls], axis=0)
+        gaps = np.min([distance_to_path(wall, points) for wall in walls], axis=0)
         if gaps.min() < CLEARANCE:
             near = points[gaps.argmin()]
             raise InputError(
-                f"the way comes within {gaps.min():.2f} m of a wall at ({near[0]:.2f}, "
+                f"the path comes within {gaps.min():.2f} m of a wall at ({near[0]:.2f}, "
                 f"{near[1]:.2f}); a robot needs {CLEARANCE} m"
             )
 
@@ -104,30 +100,30 @@ def around(points: np.ndarray, width: float) -> Float[np.ndarray, "n 4"]:
 def _paper(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
     """The paper's loop of 11.5 m × 24 m, clockwise, its begin driven again; section IV.A."""
     loop = np.array([[0, 0], [0, 24], [11.5, 24], [11.5, 0], [0, 0]], float)
-    way = np.array([[0, 1], [0, 24], [11.5, 24], [11.5, 0], [0, 0], [0, 8]], float)
-    return around(loop, 2.2), way, "blocks"
+    waypoints = np.array([[0, 1], [0, 24], [11.5, 24], [11.5, 0], [0, 0], [0, 8]], float)
+    return around(loop, 2.2), waypoints, "blocks"
 
 
 def _l(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
     bend = np.array([[0, 0], [0, 9], [8, 9]], float)
-    way = np.array([[0, -0.3], [0, 9], [7.6, 9]], float)
-    return around(bend, 2.0), way, "tiles"
+    waypoints = np.array([[0, -0.3], [0, 9], [7.6, 9]], float)
+    return around(bend, 2.0), waypoints, "tiles"
 
 
 def _t(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
     """Up the stem, left, a turn on the spot and along the whole bar."""
     stem, bar = np.array([[0, 0], [0, 8]], float), np.array([[-7, 8], [7, 8]], float)
-    way = np.array([[0, 0], [0, 8], [-6.5, 8], [6.5, 8]], float)
-    return np.concatenate([around(bar, 2.4), around(stem, 2.2)]), way, "planks"
+    waypoints = np.array([[0, 0], [0, 8], [-6.5, 8], [6.5, 8]], float)
+    return np.concatenate([around(bar, 2.4), around(stem, 2.2)]), waypoints, "planks"
 
 
 def _eight(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
     """Two loops that share the corridor in the middle, which is driven twice."""
     loops = np.array([[0, 0], [9, 0], [9, 16], [0, 16], [0, 0]], float)
     middle = np.array([[0, 8], [9, 8]], float)
-    way = [[0, 1], [0, 8], [9, 8], [9, 16], [0, 16], [0, 8], [9, 8], [9, 0], [0, 0], [0, 3]]
+    waypoints = [[0, 1], [0, 8], [9, 8], [9, 16], [0, 16], [0, 8], [9, 8], [9, 0], [0, 0], [0, 3]]
     corridors = np.concatenate([around(loops, 2.0), around(middle, 2.0)])
-    return corridors, np.array(way, float), "stripes"
+    return corridors, np.array(waypoints, float), "stripes"
 
 
 def _random(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
@@ -147,12 +143,14 @@ def _random(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
         travelled += abs(xs[at[0] + step[0]] - xs[at[0]]) + abs(ys[at[1] + step[1]] - ys[at[1]])
         at = at + step
         nodes.append(at)
-    way = np.array([[xs[i], ys[j]] for i, j in nodes])
-    side = np.stack([way[1:-1], way[1:-1]], axis=1)[rng.random(len(way) - 2) < 0.3]
+    waypoints = np.array([[xs[i], ys[j]] for i, j in nodes])
+    side = np.stack([waypoints[1:-1], waypoints[1:-1]], axis=1)[
+        rng.random(len(waypoints) - 2) < 0.3
+    ]
     side[:, 1] += steps[rng.integers(0, 4, len(side))] * rng.uniform(1.5, 3.5, (len(side), 1))
-    legs = _straight_runs(np.concatenate([np.stack([way[:-1], way[1:]], axis=1), side]))
+    legs = _straight_runs(np.concatenate([np.stack([waypoints[:-1], waypoints[1:]], axis=1), side]))
     corridors = np.concatenate([around(leg, width) for leg in legs])
-    return corridors, _corners(way), str(rng.choice(sorted(FLOORS)))
+    return corridors, _corners(waypoints), str(rng.choice(sorted(FLOORS)))
 
 
 def _on_lattice(node: np.ndarray) -> bool:
@@ -181,11 +179,11 @@ def _straight_runs(legs: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "m 2 2
     return np.array(runs)
 
 
-def _corners(way: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+def _corners(waypoints: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
     """The points of a broken line at which it bends, with its ends."""
-    d = np.sign(np.diff(way, axis=0))
+    d = np.sign(np.diff(waypoints, axis=0))
     bends = (d[1:] != d[:-1]).any(axis=1)
-    return way[np.concatenate([[True], bends, [True]])]
+    return waypoints[np.concatenate([[True], bends, [True]])]
 
 
 WORLDS = {"paper": _paper, "l": _l, "t": _t, "eight": _eight, "random": _random}

@@ -41,7 +41,7 @@ def inside(
 ) -> Bool[np.ndarray, "*batch"]:
     """Whether points lie in the union of rectangles."""
     p = points[..., None, :]
-    return ((p >= corridors[:, :2]) & (p <= corridors[:, 2:])).all(-1).any(-1)
+    return np.all((p >= corridors[:, :2]) & (p <= corridors[:, 2:]), axis=-1).any(-1)
 
 
 def left_normal(direction: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -57,11 +57,14 @@ def parts_inside(
     corridors: Float[np.ndarray, "n 4"], segment: Float[np.ndarray, "2 2"], shortest: float = 0.1
 ) -> list[np.ndarray]:
     """The parts of a segment in the union of rectangles, at least `shortest` metres long."""
-    start, way = segment[0], segment[1] - segment[0]
+    start, extent = segment[0], segment[1] - segment[0]
     parts = []
     for x0, y0, x1, y1 in corridors:
         first, last = 0.0, 1.0
-        for position, step, low, high in ((start[0], way[0], x0, x1), (start[1], way[1], y0, y1)):
+        for position, step, low, high in (
+            (start[0], extent[0], x0, x1),
+            (start[1], extent[1], y0, y1),
+        ):
             if abs(step) < 1e-12:
                 if not low <= position <= high:
                     last = -1.0
@@ -76,9 +79,9 @@ def parts_inside(
             merged[-1][1] = max(merged[-1][1], last)
         else:
             merged.append([first, last])
-    length = float(np.linalg.norm(way))
+    length = float(np.linalg.norm(extent))
     return [
-        start + np.outer(part, way) for part in merged if (part[1] - part[0]) * length > shortest
+        start + np.outer(part, extent) for part in merged if (part[1] - part[0]) * length > shortest
     ]
 
 
@@ -94,12 +97,12 @@ def offset_walls(
     return walls + distance * n[:, None] + lengthen
 
 
-def distance_to_way(
-    way: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "points 2"]
+def distance_to_path(
+    path: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "points 2"]
 ) -> Float[np.ndarray, "points"]:
     """Distance of points from a broken line, metres."""
     best = np.full(len(points), np.inf)
-    for a, b in itertools.pairwise(way):
+    for a, b in itertools.pairwise(path):
         d = b - a
         s = np.clip((points - a) @ d / max(d @ d, 1e-12), 0, 1)
         best = np.minimum(best, np.linalg.norm(points - (a + s[:, None] * d), axis=-1))

@@ -19,7 +19,7 @@ class Areas:
 
 
 @dataclass(frozen=True)
-class Lines:
+class FloorLines:
     """Narrow lines painted on the floor: joints of tiles, planks and slabs."""
 
     endpoints: Float[np.ndarray, "n 2 2"]  # of the centre line, metres
@@ -62,10 +62,10 @@ class World:
     ]  # x_min, y_min, x_max, y_max, metres; the floor is their union
     walls: Float[np.ndarray, "walls 2 2"]  # end points on the floor, the corridor on their left
     ceiling: float  # height, metres
-    way: Float[np.ndarray, "points 2"]  # centre line to drive along, metres
+    waypoints: Float[np.ndarray, "points 2"]  # centre line to drive along, metres
     look: Look
     floor_areas: Areas  # corners in the world frame
-    floor_lines: Lines
+    floor_lines: FloorLines
     wall_areas: Areas  # corners (along the wall, height), from (0, 0) at the wall's first end
     wall_of_area: Int[np.ndarray, "wall_areas"]  # index into `walls`
     lamps: Float[np.ndarray, "lamps 4"]  # rectangles on the ceiling, as `corridors`
