@@ -16,8 +16,8 @@ from test_likelihood import as_arrays, random_problem
 from sofjax import SofSlam
 from sofjax.extraction.association import Association, gate_probability
 from sofjax.geometry import SE2, Segments
+from sofjax.likelihood.density import log_density
 from sofjax.likelihood.sensor_model import SensorModel
-from sofjax.likelihood.tracking import log_density
 from sofjax.motion import OdometerBias
 from sofjax.particles import Particles, systematic
 from sofjax.slam.presets import DEFAULT

@@ -1,5 +1,7 @@
 """Segments: padded arrays of end points with a mask; section II.A."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
@@ -18,7 +20,7 @@ class Segments(eqx.Module):
     valid: Bool[Array, "*batch"]
 
     @staticmethod
-    def of(endpoints: ArrayLike | list) -> "Segments":
+    def of(endpoints: ArrayLike | list[Any]) -> "Segments":
         """Segments from end points [*batch, 2, 2], all of them valid."""
         ends = jnp.asarray(endpoints, float)
         return Segments(ends, jnp.ones(ends.shape[:-2], bool))

@@ -5,6 +5,8 @@ centre with the axes of the robot: there the apparent line of anything parallel 
 its direction, and its distance rho is the true one times the apparent scale h / (h - z).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -58,7 +60,7 @@ def measure(
     """
     nadir = mount.T_robot_nadir.xy
 
-    def on_floor(endpoints_image: Array, jitter: Array) -> tuple[Array, tuple]:
+    def on_floor(endpoints_image: Array, jitter: Array) -> tuple[Array, tuple[Any, ...]]:
         jittered = eqx.tree_at(
             lambda m: (m.pitch, m.roll), mount, (mount.pitch + jitter[0], mount.roll + jitter[1])
         )
@@ -67,7 +69,7 @@ def measure(
         line = polar_through(endpoints - nadir)
         return jnp.stack([line.rho, line.theta]), (endpoints - nadir, line, some)
 
-    def one(endpoints_image: Array) -> tuple:
+    def one(endpoints_image: Array) -> tuple[Any, ...]:
         (by_pixel, by_jitter), (endpoints, line, some) = jax.jacfwd(
             on_floor, argnums=(0, 1), has_aux=True
         )(endpoints_image, jnp.zeros(2))

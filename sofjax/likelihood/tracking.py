@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sofjax.geometry.lines import PolarLine, alignment, normal, polar_differences
-from sofjax.geometry.matrices import determinant_2x2
+from sofjax.geometry.lines import PolarLine, alignment, normal
 from sofjax.geometry.se2 import SE2
 from sofjax.likelihood.measurements import Measurements
 from sofjax.likelihood.sensor_model import SensorModel, squared_error
@@ -63,7 +62,7 @@ def mahalanobis(
     difference: Float[Array, "*batch 2"], precision: Float[Array, "*#batch 2 2"]
 ) -> Float[Array, "*batch"]:
     """e = dᵀ W d."""
-    return squared_error(_symmetric(precision), difference[..., 0], difference[..., 1])
+    return squared_error(symmetric(precision), difference[..., 0], difference[..., 1])
 
 
 class Precomputed(eqx.Module):
@@ -74,7 +73,7 @@ class Precomputed(eqx.Module):
 
     valid: Bool[Array, "M"]  # measurements
     paired: Bool[Array, "M C"]  # valid measurement, valid candidate
-    difference: tuple[Float[Array, "M C"], ...]  # of `_differences`
+    difference: tuple[Float[Array, "M C"], ...]  # of `differences`
     precision: tuple[Float[Array, "M C"], ...]  # W = S⁻¹ by its elements, without jitter
     precision_with_jitter: tuple[Float[Array, "M C"], ...]
     by_jitter: Float[Array, "M 2 2"]  # J = d(rho, theta) / d(pitch, roll)
@@ -86,8 +85,8 @@ def precompute(measurements: Measurements, candidates: Candidates) -> Precompute
     paired = measurements.valid[:, None] & candidates.valid
     difference, loose, W = jax.tree.map(
         lambda a: jnp.where(paired, a, 0),
-        (_differences(measurements, candidates), _symmetric(candidates.precision_with_jitter),
-         _symmetric(candidates.precision)),
+        (differences(measurements, candidates), symmetric(candidates.precision_with_jitter),
+         symmetric(candidates.precision)),
     )  # fmt: skip
     J = jnp.where(measurements.valid[:, None, None], measurements.by_jitter, 0)
     by_axis = [(J[:, 0, k, None], J[:, 1, k, None]) for k in range(2)]  # pitch, roll
@@ -136,7 +135,11 @@ def score(
     of_poses = lambda a: a.reshape(*a.shape, *[1] * len(poses))
 
     def error(
-        W: Sequence[Array], of: Callable, difference: tuple, rho: Any = 0.0, theta: Any = 0.0
+        W: Sequence[Array],
+        of: Callable[[Array], Array],
+        difference: tuple[Array, ...],
+        rho: Any = 0.0,
+        theta: Any = 0.0,
     ) -> Array:
         d_rho, d_theta, by_x, by_y = map(of, difference)
         moved = d_rho + (by_x * x + by_y * y), d_theta + yaw
@@ -145,7 +148,7 @@ def score(
     # a scan: it prevents XLA from recomputing all errors for each consumer of the choice
     width = 1 << C.bit_length()
 
-    def nearer(best: Array, candidate: tuple) -> tuple[Array, None]:
+    def nearer(best: Array, candidate: tuple[Any, ...]) -> tuple[Array, None]:
         c, paired, loose, difference = candidate
         key = sortable(error(loose, of_poses, difference), c, width)
         return jnp.where(of_poses(paired) & (key < best), key, best), None
@@ -169,7 +172,7 @@ def score(
         precision=jax.lax.Precision.HIGHEST,
     )  # fmt: skip
     gradient = [s[0] + s[1] * x + s[2] * y + s[3] * yaw for s in (sums[3:7], sums[7:])]
-    jitter, _, prior = _solve_jitter(sensor, sums[:3], gradient)
+    jitter, _, prior = solve_jitter(sensor, sums[:3], gradient)
 
     J = pairs.by_jitter
     rho, theta = (
@@ -201,60 +204,7 @@ def sortable(
     return (bits & -width) | jnp.asarray(index, jnp.int32)
 
 
-def log_density(
-    sensor: SensorModel,
-    measurements: Measurements,
-    candidates: Candidates,
-    T_predicted_nadir: SE2,
-    known: Float[Array, "M"],
-    lines: Float[Array, ""],
-    log_elsewhere: Float[Array, ""],
-) -> Float[Array, ""]:
-    """log p(segments | pose), the soft form of `score`, with its constants; to differentiate.
-
-    Each measurement is one of the map's lines with the probability `known`, any of them alike, and
-    anywhere in the image otherwise; the candidates stand for all lines, as the others are too far
-    away to matter. The density is that of the end points across the line, per pixel², so that it
-    falls when a sigma is too large or too small and compares different mounts. The
-    attitude jitter is integrated out about its most likely value, given each candidate's share:
-    exactly, if the shares are certain.
-
-    **Arguments:**
-    - `known`: probabilities of the measurements, less than 1.
-    - `lines`: how many of the map's lines are in view.
-    - `log_elsewhere`: log density of a segment that is no line of the map, per pixel².
-    """
-    paired = measurements.valid[:, None] & candidates.valid
-    d_rho, d_theta, by_x, by_y = _differences(measurements, candidates)
-    x, y = T_predicted_nadir.xy
-    moved = jnp.stack([d_rho + (by_x * x + by_y * y), d_theta + T_predicted_nadir.yaw], axis=-1)
-    difference = jnp.where(paired[..., None], moved, 0)
-    log_area = jnp.where(measurements.valid, measurements.log_area, 0)[:, None]
-    known = known[:, None]
-    weights = jnp.concatenate([jnp.where(paired, known / lines, 0), 1 - known], axis=1)
-    elsewhere = jnp.broadcast_to(log_elsewhere, known.shape)
-
-    def log_mixture(d: Array, W: Array) -> tuple[Array, Array]:
-        log_normal = 0.5 * (jnp.log(determinant_2x2(W)) - mahalanobis(d, W)) - jnp.log(2 * jnp.pi)
-        each = jnp.concatenate([log_normal + log_area, elsewhere], axis=1)
-        return each, jax.nn.logsumexp(each, axis=1, b=weights)
-
-    W, W_tilt = (
-        jnp.where(paired[..., None, None], a, jnp.eye(2))
-        for a in (candidates.precision, candidates.precision_with_jitter)
-    )
-    each, total = log_mixture(difference, W_tilt)
-    share = weights * jnp.exp(jnp.where(weights > 0, each - total[:, None], -jnp.inf))
-    J = jnp.broadcast_to(measurements.by_jitter[:, None], W.shape)
-    JW = jnp.swapaxes(J, -1, -2) @ (share[:, :-1, None, None] * W)
-    information = jnp.stack(_symmetric(jnp.sum(JW @ J, axis=(0, 1))))
-    gradient = jnp.sum((JW @ difference[..., None])[..., 0], axis=(0, 1))
-    jitter, volume, prior = _solve_jitter(sensor, information, gradient)
-    _, total = log_mixture(difference - J @ jitter, W)
-    return jnp.sum(jnp.where(measurements.valid, total, 0)) - 0.5 * (prior + jnp.log(volume))
-
-
-def _differences(
+def differences(
     measurements: Measurements, candidates: Candidates
 ) -> tuple[Float[Array, "M C"], ...]:
     """Observed less expected as the predicted nadir would see it, and what moving the nadir adds.
@@ -263,17 +213,18 @@ def _differences(
     to that in rho; a turn adds itself to that in theta.
     """
     observed = jax.tree.map(lambda a: a[:, None], measurements.line)
-    d_rho, d_theta = polar_differences(observed, candidates.line)
+    d_rho, d_theta = polardifferences(observed, candidates.line)
     nearing = (alignment(observed, candidates.line) * candidates.apparent_scale)[..., None]
     by_nadir = nearing * normal(candidates.line)
     return d_rho, d_theta, by_nadir[..., 0], by_nadir[..., 1]
 
 
-def _symmetric(W: Float[Array, "*batch 2 2"]) -> tuple[Array, Array, Array]:
+def symmetric(W: Float[Array, "*batch 2 2"]) -> tuple[Array, Array, Array]:
+    """The elements (0, 0), (0, 1), (1, 1) of symmetric matrices."""
     return W[..., 0, 0], W[..., 0, 1], W[..., 1, 1]
 
 
-def _solve_jitter(
+def solve_jitter(
     sensor: SensorModel, information: Sequence[Array] | Array, gradient: Sequence[Array] | Array
 ) -> tuple[Array, Array, Array]:
     """The most likely jitter of errors d = J jitter + noise: A = Jᵀ W J and b = Jᵀ W d given.

@@ -42,7 +42,7 @@ def advance(
     )
     unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
     detected = extracted.segments_image.valid
-    stages = detected, measurements.valid, measurements.valid & (known | updated.new)
+    on_floor = measurements.valid & (known | updated.new)
     info = StepInfo(
         T_world_robot=chosen.T_world_robot,
         covariance=pose_covariance(chosen.weighted),
@@ -61,7 +61,7 @@ def advance(
         map_overflow=updated.overflow,
         map_truncated=local.truncated,
         lost=unmatched >= LOST_AFTER,
-        segment_class=sum(stage.astype(int) for stage in stages),
+        segment_class=detected.astype(int) + measurements.valid.astype(int) + on_floor.astype(int),
     )
     after = SlamState(
         chosen.particles, updated.segment_map, recent, reference, inflation, unmatched, key,

@@ -5,12 +5,13 @@ eliminated (Triggs et al., Bundle adjustment, a modern synthesis, 2000, section 
 """
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from sofjax.geometry.lines import (
     PolarLine,
@@ -35,7 +36,10 @@ HALF = 16.0  # at which it counts half (Cauchy)
 LEAST = 3e-4  # metres, radians: no reading of the odometer is better
 
 
-def where_each(condition: Bool[Array, "n"], a: PyTree, b: PyTree) -> PyTree:
+Tree = TypeVar("Tree")
+
+
+def where_each(condition: Bool[Array, "n"], a: Tree, b: Tree) -> Tree:
     """`jnp.where` of two trees by the first axis of all leaves."""
     one = lambda a, b: jnp.where(condition.reshape(-1, *[1] * (a.ndim - 1)), a, b)
     return jax.tree.map(one, a, b)
@@ -63,8 +67,9 @@ def look(
     level = eqx.tree_at(lambda s: s.line, measurements, measurements.without_jitter(frame.jitter))
     _, at, error = candidate_associations(map_config, sensor, lines, level, T_world_nadir, most=1)
     at, paired = at[:, 0], measurements.valid & (error < GATE)
-    of_each = jax.tree.map(lambda a: a[at], (lines.line, lines.anchor))
-    expected, _ = jax.vmap(predict_measurement, in_axes=(0, 0, None))(*of_each, T_world_nadir)
+    line_of, anchor_of = jax.tree.map(lambda a: a[at], (lines.line, lines.anchor))
+    predicted = jax.vmap(predict_measurement, in_axes=(0, 0, None))
+    expected, _ = predicted(line_of, anchor_of, T_world_nadir)
     line = PolarLine(expected[:, 0], expected[:, 1])
     side = alignment(line, measurements.line)
     covariance = rename_covariance(measurements.covariance, side)
@@ -187,17 +192,19 @@ def gauss_newton(
     b = jnp.pad(jnp.einsum("wmaj,wmj->wa", JpW, linear.error).reshape(-1), (0, BIAS)) - J.T @ r
 
     # of the lines, and between those and the poses
-    C, c = _of_lines(known, line, linear)
-    C, c = C.at[:, 2, 2].add(floor), c.at[:, 2].add(floor * (1 - line[:, 2]))
+    free, c = _of_lines(known, line, linear)
+    C, c = free.at[:, 2, 2].add(floor), c.at[:, 2].add(floor * (1 - line[:, 2]))
     frame = jnp.broadcast_to(jnp.arange(W)[:, None], linear.line.shape)
-    E = jnp.zeros((linear.lines, W, 3, POSE)).at[linear.line, frame].add(JlW @ linear.by_pose)
-    E = jnp.pad(jnp.swapaxes(E, 1, 2).reshape(-1, 3, W * POSE), [(0, 0), (0, 0), (0, BIAS)])
+    each = jnp.zeros((linear.lines, W, 3, POSE)).at[linear.line, frame].add(JlW @ linear.by_pose)
+    E = jnp.pad(jnp.swapaxes(each, 1, 2).reshape(-1, 3, W * POSE), [(0, 0), (0, 0), (0, BIAS)])
 
     S = jnp.linalg.solve(C, jnp.concatenate([E, c[..., None]], axis=2))
-    A, b = A - jnp.einsum("kax,kay->xy", E, S[..., :-1]), b - jnp.einsum("kax,ka->x", E, S[..., -1])
-    A, b = jnp.where(held[:, None] | held, jnp.eye(n), A), jnp.where(held, 0, b)
-    scale = jnp.diag(A) ** -0.5  # metres and radians
-    x = scale * cho_solve(cho_factor(A * scale[:, None] * scale), scale * b)
+    reduced = A - jnp.einsum("kax,kay->xy", E, S[..., :-1])
+    b = b - jnp.einsum("kax,ka->x", E, S[..., -1])
+    reduced = jnp.where(held[:, None] | held, jnp.eye(n), reduced)
+    b = jnp.where(held, 0, b)
+    scale = jnp.diag(reduced) ** -0.5  # metres and radians
+    x = scale * cho_solve(cho_factor(reduced * scale[:, None] * scale), scale * b)
     return x, line + S[..., -1] - S[..., :-1] @ x
 
 

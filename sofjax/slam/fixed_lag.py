@@ -111,7 +111,7 @@ def slide(
     variance = window.unread + image.unread_sigma**2
     window = Window(window.keyframes, window.count, known, motion, way, variance)
 
-    usable = measurements.valid & ~measurements.upright
+    usable = measurements.valid & jnp.logical_not(measurements.upright)
     far = (way[0] >= config.step) | (way[1] - way[2] >= config.turn)
     due = usable.any() & (far | (window.count == 0))
 
@@ -150,7 +150,7 @@ def _solve(
     oldest, (shown, frames) = (
         jax.tree.map(lambda a, s=s: a[s], (shown, frames)) for s in (slice(0, 1), slice(1, None))
     )
-    known = learned(known, lines.line, linear(*oldest, lines.line))
+    known = learned(known, lines.line, linear(oldest[0], oldest[1], lines.line))
 
     off_floor = is_off_floor(map_config, lines.line, lines.covariance)
     line = lines.line.at[:, 2].set(jnp.where(off_floor, lines.line[:, 2], 1))

@@ -34,7 +34,7 @@ def update_map(
     known = best.error < sensor.e_max
     unlike = local.nearest > sensor.e_max
     counted = counted_from(setup, extracted, T_world_robot)
-    new = extracted.is_sof & unlike & counted & ~known & ~measurements.upright
+    new = extracted.is_sof & unlike & counted & ~known & jnp.logical_not(measurements.upright)
     segment_map, overflow, new_slots = integrate(
         config, sensor, segment_map, local.near, measurements,
         jnp.take_along_axis(local.at, best.choice[:, None], 1)[:, 0], local.at,

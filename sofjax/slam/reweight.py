@@ -7,8 +7,9 @@ from jaxtyping import Array, Float, Int
 
 from sofjax._pytree import half_if_enough
 from sofjax.geometry.se2 import SE2
+from sofjax.likelihood.density import log_density
 from sofjax.likelihood.measurements import Measurements
-from sofjax.likelihood.tracking import Candidates, Precomputed, log_density, precompute, score
+from sofjax.likelihood.tracking import Candidates, Precomputed, precompute, score
 from sofjax.particles import Particles
 from sofjax.segment_map import SegmentMap, candidate_associations, in_view, nearby
 from sofjax.slam.config import Setup

@@ -59,7 +59,8 @@ def initial_state(setup: Setup, key: PRNGKeyArray, capacity: int) -> SlamState:
     - `key`: a typed key, `jax.random.key(0)`.
     - `capacity`: M, the number of segments that an observation has room for.
     """
-    if not jnp.issubdtype(getattr(key, "dtype", None), jax.dtypes.prng_key):
+    kind = getattr(key, "dtype", None)
+    if kind is None or not jnp.issubdtype(kind, jax.dtypes.prng_key):
         raise ValueError(f"key must be a jax.random.key(...), not a {type(key).__name__}")
     config = setup.config
     N = config.filter.particles

@@ -1,13 +1,13 @@
 """log L of N particles, M observed and K map segments; section III.A for whole clouds at once."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from sofjax.extraction.sof import put_on_floor
 from sofjax.geometry.camera import Camera, Mount
@@ -126,13 +126,13 @@ def image_log_likelihood(
 
 
 @jax.custom_jvp
-def _without_derivative(given: PyTree) -> PyTree:
+def _without_derivative(given: Any) -> Any:
     """The same; a derivative is refused instead of returned as zero."""
     return given
 
 
 @functools.partial(_without_derivative.defjvp, symbolic_zeros=True)
-def _refuse_derivative(primals: tuple, tangents: tuple) -> tuple:
+def _refuse_derivative(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     leaves = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     if not all(isinstance(leaf, SymbolicZero) for leaf in leaves):
         raise ValueError(
@@ -154,7 +154,7 @@ def _log_likelihood(
 ) -> tuple[Float[Array, "N"], Bool[Array, ""] | bool]:
     N, M, K = len(particles.yaw), len(observed.valid), len(segment_map.valid)
     counts = observed.valid[:, None] if used is None else observed.valid[:, None] & used.T
-    e_max, tau = noise.e_max, noise.gap_scale
+    e_max, tau = jnp.asarray(noise.e_max), jnp.asarray(noise.gap_scale)
     counts = counts.astype(e_max.dtype)
     diagonal = covariance is None
     constant = jnp.diag(jnp.stack([noise.rho_sigma, noise.theta_sigma]) ** 2)

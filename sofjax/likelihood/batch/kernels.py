@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, Int
 
 from sofjax.likelihood.batch.culling import Reach
 from sofjax.likelihood.batch.prepare import Cloud, Seen, larger
@@ -83,19 +83,20 @@ def gaps(row: Row, line: Float[Array, "8"]) -> tuple[Array, Array]:
 
 
 def over_groups(
-    near: Reach, m: Int[Array, ""], start: PyTree, add: Callable[[Any, Array], PyTree]
-) -> PyTree:
+    near: Reach, m: Int[Array, ""], start: Any, add: Callable[[Any, Array], Any]
+) -> Any:
     """`add(carry, lines [size, 8])` for every group of map segments within reach of segment m."""
     size = near.index.shape[2]
 
-    def step(carry: tuple) -> tuple:
+    def step(carry: tuple[Array, Any]) -> tuple[Array, Any]:
         g, value = carry
         return g + 1, add(value, near.table[near.index[m, g]])
 
-    return lax.while_loop(lambda carry: carry[0] * size < near.count[m], step, (0, start))[1]
+    begin: Any = (0, start)
+    return lax.while_loop(lambda carry: carry[0] * size < near.count[m], step, begin)[1]
 
 
-def over_observed(near: Reach, start: PyTree, add: Callable[[Any, Array], PyTree]) -> PyTree:
+def over_observed(near: Reach, start: Any, add: Callable[[Any, Array], Any]) -> Any:
     """`add(carry, m)` for every observed segment that anything is within reach of."""
     some = near.count > 0
     chosen = jnp.nonzero(some, size=len(some))[0]

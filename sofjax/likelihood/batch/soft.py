@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from sofjax.likelihood.batch.culling import reach
 from sofjax.likelihood.batch.kernels import Row, gaps, over_groups, over_observed, row, whitened
@@ -53,7 +53,9 @@ def soft(
 
 
 @functools.partial(soft.defjvp, symbolic_zeros=True)
-def _soft_jvp(diagonal: bool, prune: bool, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+def _soft_jvp(
+    diagonal: bool, prune: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]
+) -> tuple[Array, Array]:
     cloud, seen, lines, e_max, tau, counts = primals
     d_cloud, d_seen, d_lines, d_e_max, _, _ = tangents
     by_noise = _moves([d_seen.a, d_seen.b, d_seen.c])
@@ -78,14 +80,15 @@ def _soft_jvp(diagonal: bool, prune: bool, primals: tuple, tangents: tuple) -> t
     return value, tangent
 
 
-def _moves(tangents: PyTree) -> bool:
+def _moves(tangents: Any) -> bool:
     is_zero = lambda leaf: isinstance(leaf, SymbolicZero)
     return not all(map(is_zero, jax.tree.leaves(tangents, is_leaf=is_zero)))
 
 
 def _dense(tangent: Any) -> Any:
     if isinstance(tangent, SymbolicZero):
-        return jnp.zeros(tangent.shape, tangent.dtype)
+        zero: Any = tangent
+        return jnp.zeros(zero.shape, zero.dtype)
     return tangent
 
 
@@ -108,13 +111,9 @@ def _one_pass(
     per_pose = ("x", "y", "yaw") if "pose" in wanted else ()
     per_seen = ("theta", "rho", "along", "half") if "place" in wanted else ()
     per_seen += ("a", "b", "c") if "noise" in wanted else ()
-    sums = ["u"]
-    sums += ["x", "y"] if "pose" in wanted else []
-    sums += ["gap", "theta"] if "pose" in wanted or "place" in wanted else []
-    sums += ["z", "length"] if "place" in wanted else []
-    sums += ["zz", "zt", "tt"] if "noise" in wanted else []
+    sums = _sums(wanted)
 
-    def one(carry: tuple, m: Array) -> tuple:
+    def one(carry: tuple[Any, ...], m: Array) -> tuple[Any, ...]:
         value, by_e_max, by_pose, by_seen = carry
         r = row(cloud, trigonometry, seen, near, m, 1 / tau, diagonal)
         start = _pair_up({name: zero for name in sums})
@@ -189,6 +188,16 @@ def _add(total: Sums, group: Array, r: Row, e_max: Array) -> Sums:
         term = terms(line)
         total = {name: value + term[name] for name, value in total.items()}
     return total
+
+
+def _sums(wanted: tuple[str, ...]) -> list[str]:
+    """Names of the sums over k that the wanted derivatives are made of."""
+    sums = ["u"]
+    sums += ["x", "y"] if "pose" in wanted else []
+    sums += ["gap", "theta"] if "pose" in wanted or "place" in wanted else []
+    sums += ["z", "length"] if "place" in wanted else []
+    sums += ["zz", "zt", "tt"] if "noise" in wanted else []
+    return sums
 
 
 # On the CPU, XLA writes one loop for every result, and each would work out its pairs anew. Two sums
