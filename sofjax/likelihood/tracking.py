@@ -213,7 +213,7 @@ def differences(
     to that in rho; a turn adds itself to that in theta.
     """
     observed = jax.tree.map(lambda a: a[:, None], measurements.line)
-    d_rho, d_theta = polardifferences(observed, candidates.line)
+    d_rho, d_theta = polar_differences(observed, candidates.line)
     nearing = (alignment(observed, candidates.line) * candidates.apparent_scale)[..., None]
     by_nadir = nearing * normal(candidates.line)
     return d_rho, d_theta, by_nadir[..., 0], by_nadir[..., 1]
