@@ -3,7 +3,9 @@
 from collections.abc import Callable
 
 import jax
-from jaxtyping import Array, Bool, PyTree
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 
 def half_if_enough(f: Callable[[PyTree], PyTree], rows: PyTree, there: Bool[Array, "M"]) -> PyTree:
@@ -32,3 +34,13 @@ def in_any_run(condition: Bool[Array, ""]) -> Bool[Array, ""]:
 @in_any_run.def_vmap
 def _of_batch(axis_size, in_batched, condition):
     return in_any_run(condition.any()), False
+
+
+def in_double(tree: PyTree) -> PyTree:
+    """The tree with its floating point leaves in float64; to be called where x64 is enabled."""
+
+    def one(leaf: ArrayLike) -> Array:
+        leaf = np.asarray(leaf)
+        return jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
+
+    return jax.tree.map(one, tree)

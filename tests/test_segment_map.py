@@ -16,6 +16,7 @@ from sofjax.likelihood.measurements import Measurements
 from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.segment_map import (
     MapConfig,
+    Observed,
     SegmentMap,
     candidate_associations,
     empty_map,
@@ -68,9 +69,20 @@ def see(segment_map, *ends, at=None, slots=None, rules=GAMMA, sigma=0.01, view=(
     new = measurements.valid & ~known
     shown = jnp.zeros(K, bool).at[jnp.array(view, int)].set(True)
     return grow(
-        rules, STIFF, segment_map, jnp.arange(K), measurements, slot, everything(K), known, new,
-        jnp.zeros(2), shown, at,
+        rules, STIFF, segment_map,
+        Observed(
+            measurements, jnp.zeros(2), at, jnp.arange(K), shown, slot, known, everything(K), new
+        ),
     )[:2]  # fmt: skip
+
+
+def of_image(measurements, known, new, at=None, jitter=(0.0, 0.0)):
+    """All measurements are of slot 0, and all of the map is near, and out of view."""
+    where = pose() if at is None else at
+    return Observed(
+        measurements, jnp.array(jitter), where, jnp.arange(K), jnp.zeros(K, bool),
+        jnp.zeros(M, int), known, everything(K), new,
+    )  # fmt: skip
 
 
 def seen(segment_map, *ends, **options):
@@ -155,8 +167,8 @@ def test_where_new_lines_begin_is_told():
     )
     known = jnp.arange(M) < 1
     after, _, slot = grow(
-        GAMMA, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), everything(K), known,
-        s.valid & ~known, jnp.zeros(2), jnp.zeros(K, bool), pose(),
+        GAMMA, STIFF, m,
+        of_image(s, known, s.valid & ~known),
     )  # fmt: skip
     np.testing.assert_array_equal(slot, [K, 1, 2] + [K] * (M - 3))
     assert offset(after, 2) == pytest.approx(3)
@@ -229,9 +241,9 @@ def test_correlated_errors_turn_with_the_name_when_a_line_is_updated():
     known = jnp.arange(M) < 1
     there, back = (
         grow(
-            KALMAN, STIFF, m, jnp.arange(K), s, jnp.zeros(M, int), everything(K), known,
-            ~known & s.valid, jnp.zeros(2), jnp.zeros(K, bool), pose(),
-        )[0]
+        KALMAN, STIFF, m,
+        of_image(s, known, ~known & s.valid),
+    )[0]
         for s in named_both_ways()
     )  # fmt: skip
     np.testing.assert_allclose(there.line[0], back.line[0], rtol=1e-9)
@@ -559,8 +571,8 @@ def test_a_jitter_is_taken_out_of_what_is_integrated():
     m = seen(empty_map(GAMMA), across(1.0))
     known = jnp.arange(M) < 1
     after, *_ = grow(
-        GAMMA, STIFF, m, jnp.arange(K), measurements, jnp.zeros(M, int), everything(K), known,
-        ~known & measurements.valid, jnp.array([0.01, 0.0]), jnp.zeros(K, bool), pose(),
+        GAMMA, STIFF, m,
+        of_image(measurements, known, ~known & measurements.valid, jitter=(0.01, 0.0)),
     )  # fmt: skip
     assert offset(after) == pytest.approx(1.0)
 
@@ -684,8 +696,11 @@ def test_lines_beyond_those_nearby_only_age():
     np.testing.assert_array_equal(near, [0, 1])
     known = jnp.arange(M) < 1
     after, *_ = jit_quickly(integrate)(
-        rules, STIFF, m, near, measurements_of(across(2.2)), jnp.ones(M, int),
-        everything(len(near)), known, ~known & known, jnp.zeros(2), jnp.zeros(2, bool), pose(),
+        rules, STIFF, m,
+        Observed(
+            measurements_of(across(2.2)), jnp.zeros(2), pose(), near, jnp.zeros(2, bool),
+            jnp.ones(M, int), known, everything(len(near)), ~known & known,
+        ),
     )  # fmt: skip
     np.testing.assert_array_equal(after.updates[:3], [1, 2, 1])
     np.testing.assert_array_equal(

@@ -108,6 +108,13 @@ CAMERA = Camera(jnp.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]), 320, 240
 MOUNT = Mount.create(x=0.1, height=0.8, pitch=0.4)
 
 
+def keyframe(segments_image, driven=0.0):
+    """One that shows nothing yet."""
+    none = jnp.zeros(segments_image.valid.shape, int)
+    still = SE2(jnp.zeros((1, 2)), jnp.zeros(1))
+    return Keyframes(segments_image, none, none > 0, still, jnp.array([[driven, 0.0, 0.0]]))
+
+
 def test_a_segment_shows_the_nearest_line_that_reaches_it():
     lines = lines_along_x([0.3, 0.32, -0.3], [[1, 2], [1, 2], [4, 5]])
     np.testing.assert_allclose(lines.endpoints_world[0], [[1, 0.3], [2, 0.3]], atol=1e-6)
@@ -120,17 +127,8 @@ def test_a_segment_shows_the_nearest_line_that_reaches_it():
     image, ahead = jax.vmap(jax.vmap(floor_to_image, (None, 0)), (None, 0))(H_F, floor)
     assert ahead.all()
     unknowns = Unknowns(jnp.zeros((1, 5)), lines.line, jnp.zeros(8))
-    index, known = associate(
-        Seeing(),
-        8.0,
-        1.0,
-        CAMERA,
-        MOUNT,
-        lines,
-        unknowns,
-        Segments(image[None], jnp.ones((1, 3), bool)),
-        jnp.zeros(1),
-    )
+    seen = keyframe(Segments(image[None], jnp.ones((1, 3), bool)))
+    index, known = associate(Seeing(), 8.0, 1.0, CAMERA, MOUNT, lines, unknowns, seen)
     assert known.tolist() == [[True, False, False]]
     assert index[0, 0] == 0
 
@@ -148,11 +146,9 @@ def test_what_may_be_upright_or_was_passed_shows_no_line(y, driven, shows):
     lines = replace(lines, span=jnp.array([[0.0, 6.0]]))
     H_F = floor_homography(CAMERA, MOUNT, SE2.identity())
     ends = jax.vmap(lambda p: floor_to_image(H_F, p)[0])(jnp.array([[1.2, y], [1.8, y]]))
-    seen = Segments(ends[None, None], jnp.ones((1, 1), bool))
+    seen = keyframe(Segments(ends[None, None], jnp.ones((1, 1), bool)), driven)
     unknowns = Unknowns(jnp.zeros((1, 5)), lines.line, jnp.zeros(8))
-    _, known = associate(
-        Seeing(), 8.0, 1.0, CAMERA, MOUNT, lines, unknowns, seen, jnp.array([driven])
-    )
+    _, known = associate(Seeing(), 8.0, 1.0, CAMERA, MOUNT, lines, unknowns, seen)
     assert bool(known[0, 0]) == shows
 
 
@@ -262,26 +258,6 @@ def known(joint):
     within = within.at[0, 5 : 5 + 3 * K, 5 : 5 + 3 * K].set(joint.reshape(3 * K, 3 * K))
     factors = Factors(dissection, (jnp.zeros((1, a, a)),), (jnp.zeros((1, a, q)),))
     return Marginals(factors, (within,), jnp.zeros((1, 5, 5)))
-
-
-@pytest.mark.parametrize(
-    ("apparent_scale", "sigma", "off_floor", "is_shown"),
-    [
-        (1.01, 0.01, False, True),
-        (1.10, 0.02, True, False),
-        (1.02, 0.04, True, True),  # its height was left free; it would be the floor's
-        (1.10, 0.04, True, False),  # ... or the top of a baseboard's
-        (1.02, 0.10, True, False),  # ... or anything
-    ],
-)
-def test_lines_of_the_floor_are_shown(apparent_scale, sigma, off_floor, is_shown):
-    lines = lines_along_x([0.3], [(1, 2)])
-    undetermined = off_floor and sigma > SmoothingConfig().scale_known
-    lines = replace(lines, off_floor=jnp.array([off_floor]), undetermined=jnp.array([undetermined]))
-    told = smoother.shown(
-        MapConfig(), SmoothingConfig(), lines, jnp.array([apparent_scale]), jnp.array([sigma])
-    )
-    assert bool(told[0]) == is_shown
 
 
 def test_names_are_handed_on_to_the_end():

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sofjax.geometry.lines import PolarLine, alignment, normal
+from sofjax.geometry.lines import PolarLine, alignment, normal, polar_differences
 from sofjax.geometry.se2 import SE2
 from sofjax.likelihood.measurements import Measurements
 from sofjax.likelihood.sensor_model import SensorModel, squared_error

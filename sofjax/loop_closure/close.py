@@ -42,7 +42,7 @@ def close(
     asked = []
     for _ in range(SOLUTIONS):
         done = smooth(config, camera, mount, log, path, segment_map, rules)
-        final = final_map(config, rules, done)
+        final = final_map(config.segment_map, done)
         known = solved(done, final)
         now = revisits(closing, known)
         accepted = [revisit for revisit in now if revisit.closing.accepted]

@@ -14,18 +14,15 @@ from sofjax.geometry.segments import overlap
 from sofjax.likelihood.measurements import Measurements
 from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.likelihood.tracking import Candidates, sortable
-from sofjax.segment_map.types import (
-    MapConfig,
-    SegmentMap,
-    posterior_given_class,
-    predict_measurement,
-)
+from sofjax.segment_map.classify import posterior_given_class
+from sofjax.segment_map.local_map import predict_measurement
+from sofjax.segment_map.types import MapConfig, SegmentMap
 
 NOTHING = np.iinfo(np.int32).max
 
 
 def candidate_associations(
-    rules: MapConfig,
+    config: MapConfig,
     sensor: SensorModel,
     segment_map: SegmentMap,
     measurements: Measurements,
@@ -35,18 +32,25 @@ def candidate_associations(
     """The C map lines most like each measurement, as they should appear from the predicted nadir.
 
     **Arguments:**
-    - `most`: C, if not that of the rules.
+    - `most`: C, if not that of the settings.
 
     **Returns:** the candidates; their slots in the map; and for each measurement the smallest error
     of all map lines, overlapping or not by up to `join_gap`.
     """
-    among = lambda lines: _among(rules, sensor, lines, measurements, T_world_nadir, most)
+    among = lambda lines: _among(config, sensor, lines, measurements, T_world_nadir, most)
     return half_if_enough(among, segment_map, segment_map.valid)
 
 
-def _among(rules, sensor, segment_map, measurements, T_world_nadir, most):
+def _among(
+    config: MapConfig,
+    sensor: SensorModel,
+    segment_map: SegmentMap,
+    measurements: Measurements,
+    T_world_nadir: SE2,
+    most: int | None,
+) -> tuple[Candidates, Int[Array, "M C"], Float[Array, "M"]]:
     line, covariance = jax.vmap(posterior_given_class, in_axes=(None, 0, 0))(
-        rules, segment_map.line, segment_map.covariance
+        config, segment_map.line, segment_map.covariance
     )
     seen, H = jax.vmap(predict_measurement, in_axes=(0, 0, None))(
         line, segment_map.anchor, T_world_nadir
@@ -55,13 +59,13 @@ def _among(rules, sensor, segment_map, measurements, T_world_nadir, most):
     spread = H @ covariance @ jnp.swapaxes(H, 1, 2)
     if not sensor.propagate:
         spread = jnp.zeros_like(spread)
-    drift = jnp.diag(jnp.array([rules.rho_drift, rules.theta_drift]) ** 2)
-    tilting = (
+    drift = jnp.diag(jnp.array([config.rho_drift, config.theta_drift]) ** 2)
+    jitter = (
         sensor.tilt_sigma**2 * measurements.by_jitter @ jnp.swapaxes(measurements.by_jitter, 1, 2)
     )
 
     # all M × K pairs, in numbers and not in 2×2 matrices: so they compile to one loop
-    near, far = measurements.covariance + tilting, spread + drift
+    near, far = measurements.covariance + jitter, spread + drift
     observed = PolarLine(measurements.line.rho[:, None], measurements.line.theta[:, None])
     side = alignment(observed, lines)  # a measurement may be named from the other side
     s = lambda i, j: near[:, None, i, j] + (1 if i == j else side) * far[:, i, j]
@@ -74,18 +78,18 @@ def _among(rules, sensor, segment_map, measurements, T_world_nadir, most):
         T_world_nadir.inverse().apply(segment_map.segments_world.endpoints) * seen[:, 2, None, None]
     )
     share = overlap(extent, measurements.endpoints_nadir[:, None])
-    possible = segment_map.valid & (share > -rules.join_gap)
-    if rules.directed:
+    possible = segment_map.valid & (share > -config.join_gap)
+    if config.directed:
         possible = possible & (jnp.abs(wrap(observed.theta - lines.theta)) < jnp.pi / 2)
     error = jnp.where(possible, error, jnp.inf)
-    best, slot = _smallest(error, most or rules.candidates)
+    best, slot = _smallest(error, most or config.candidates)
     far = rename_covariance(far[slot], jnp.take_along_axis(side, slot, axis=1))
     S = measurements.covariance[:, None] + far
     candidates = Candidates(
         line=PolarLine(lines.rho[slot], lines.theta[slot]),
         apparent_scale=seen[slot, 2],
         precision=inverse_2x2(S),
-        precision_with_jitter=inverse_2x2(S + tilting[:, None]),
+        precision_with_jitter=inverse_2x2(S + jitter[:, None]),
         valid=jnp.isfinite(best),
     )
     return candidates, slot, best[:, 0]
@@ -103,13 +107,13 @@ def _smallest(
     key = sortable(error, jnp.arange(K), width)
     key = jnp.pad(key, [(0, 0), (0, width - K)], constant_values=NOTHING)
 
-    def next_smallest(last, _):
+    def next_smallest(last: Array, _: None) -> tuple[Array, Array]:
         rest = jnp.where(key > last, key, NOTHING)
         while rest.shape[1] > 1:
             rest = jnp.minimum(*jnp.split(rest, 2, axis=1))
         return rest, rest[:, 0]
 
-    # a scan, as each minimum would otherwise work all errors out anew
+    # a scan: it prevents XLA from recomputing all errors for each minimum
     none = jnp.full((len(key), 1), -1, jnp.int32)
     found = jax.lax.scan(next_smallest, none, None, length=count)[1].T
     slot = jnp.minimum(found & (width - 1), K - 1)

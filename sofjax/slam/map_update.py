@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from sofjax.segment_map import SegmentMap, in_view, integrate
+from sofjax.segment_map import Observed, SegmentMap, in_view, integrate
 from sofjax.slam.choose import Chosen
 from sofjax.slam.config import Setup
 from sofjax.slam.extract import Extracted, counted_from
@@ -35,11 +35,15 @@ def update_map(
     unlike = local.nearest > sensor.e_max
     counted = counted_from(setup, extracted, T_world_robot)
     new = extracted.is_sof & unlike & counted & ~known & jnp.logical_not(measurements.upright)
-    segment_map, overflow, new_slots = integrate(
-        config, sensor, segment_map, local.near, measurements,
-        jnp.take_along_axis(local.at, best.choice[:, None], 1)[:, 0], local.at,
-        known, new, best.jitter,
-        in_view(config, setup.camera, setup.mount, local.lines, T_world_robot),
-        T_world_robot @ setup.mount.T_robot_nadir,
+    seen = in_view(config, setup.camera, setup.mount, local.lines, T_world_robot)
+    observed = Observed(
+        measurements, best.jitter, T_world_robot @ setup.mount.T_robot_nadir,
+        near=local.near,
+        in_view=seen,
+        at=jnp.take_along_axis(local.at, best.choice[:, None], 1)[:, 0],
+        known=known,
+        like=local.at,
+        new=new,
     )  # fmt: skip
+    segment_map, overflow, new_slots = integrate(config, sensor, segment_map, observed)
     return Updated(segment_map, known, new, new_slots, overflow)

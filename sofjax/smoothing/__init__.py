@@ -11,6 +11,7 @@ eliminated there (`dissection`, `elimination`), however often places are passed 
 
 from sofjax.smoothing.association.lines import Lines as Lines
 from sofjax.smoothing.association.lines import Seeing as Seeing
+from sofjax.smoothing.final import final_map as final_map
 from sofjax.smoothing.problem import Keyframes as Keyframes
 from sofjax.smoothing.problem import Priors as Priors
 from sofjax.smoothing.problem import Problem as Problem
@@ -20,7 +21,6 @@ from sofjax.smoothing.problem import robust as robust
 from sofjax.smoothing.smoother import Path as Path
 from sofjax.smoothing.smoother import Smoothed as Smoothed
 from sofjax.smoothing.smoother import SmoothingConfig as SmoothingConfig
-from sofjax.smoothing.smoother import final_map as final_map
 from sofjax.smoothing.smoother import smooth as smooth
 from sofjax.smoothing.solution import Solution as Solution
 from sofjax.smoothing.solution import solve as solve

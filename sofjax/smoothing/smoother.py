@@ -4,17 +4,26 @@ Associations that were made online bake the mistakes of the moment in; with the 
 they are made anew, and then the solution is found anew.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
+from sofjax._pytree import in_double
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.se2 import SE2
 from sofjax.motion import without_unread_motions
-from sofjax.segment_map import FinalMap, MapConfig, SegmentMap, is_off_floor, on_floor
+from sofjax.segment_map import (
+    MapConfig,
+    SegmentMap,
+    is_off_floor,
+    on_floor,
+    scale_is_off_floor,
+)
 from sofjax.slam.config import SlamConfig
 from sofjax.smoothing import keyframes as kf
 from sofjax.smoothing.association.duplicates import duplicates, representatives
@@ -46,9 +55,7 @@ class SmoothingConfig(eqx.Module):
     turn: float = 0.1  # ... or radians
     min_measurements: int = 3  # keyframes that a line takes
     room: int = eqx.field(static=True, default=kf.PAD)  # least sizes of what is compiled
-    scale_known: float = 0.03  # standard deviation from which on a line's height is left free ...
-    scale_shown: float = 0.05  # ... and up to which it may yet be one of the final map
-    passing: float = 10.0  # metres driven after which what is seen again is told anew
+    passing: float = 10.0  # metres driven after which a revisit starts a new line
     seeing: Seeing = Seeing()
 
 
@@ -102,55 +109,17 @@ def smooth(
     priors = _priors(config, rules)
     log = without_unread_motions(log)
     with jax.enable_x64(True):
-        config, camera, mount, log, path, segment_map, rules, priors = map(
-            _in_double, (config, camera, mount, log, path, segment_map, rules, priors)
-        )
+        given = config, camera, mount, log, path, segment_map, rules, priors
+        config, camera, mount, log, path, segment_map, rules, priors = map(in_double, given)
         index = kf.choose(path.T_world_robot, float(rules.step * mount.height), float(rules.turn))
         frames = kf.gather(log, index, rules.room)
         lines = _lines_of_map(config.segment_map, segment_map, rules)
         start = _start(path, kf.filled(index, len(frames.way)), lines)
         problem = Problem(
-            camera,
-            mount,
-            config.motion,
-            priors,
-            frames,
-            lines.anchor,
-            lines.off_floor,
-            start,
+            camera, mount, config.motion, priors, frames, lines.anchor, lines.off_floor, start
         )
-        costs, merged, dissection = [], 0, None
-        leaf = divide(np.asarray(start.pose[:, :2]))
-
-        def solved(problem, lines, tolerance, sure=True):
-            nonlocal dissection
-            dissection = dissect(problem.keyframes, len(lines.valid), leaf, dissection)
-            problem, lines, solution = _solved(
-                config, rules, problem, lines, dissection, tolerance, sure
-            )
-            costs.append((float(solution.cost_before), float(solution.cost)))
-            return problem, lines, solution
-
-        problem = _associated(config, rules, problem, lines, frames)
-        problem, lines = apart(
-            problem, lines, float(rules.passing), int(rules.min_measurements), rules.room
-        )
-        for left in reversed(range(rules.rounds)):
-            if left < rules.rounds - 1:
-                problem = _associated(config, rules, problem, lines, frames)
-            tolerance = ROUGH if left else TOLERANCE
-            problem, lines, solution = solved(problem, lines, tolerance)
-            problem, lines, bent = _straight(config, problem, lines)
-            into, joins = duplicates(
-                lines, solution.marginals, measurements(problem.keyframes, lines)
-            )
-            if bent or joins.any():
-                merged += int(joins.sum())
-                problem, lines = renamed(problem, lines, representatives(into, joins))
-                problem, lines, solution = solved(problem, lines, tolerance, sure=left == 0)
-        problem, lines, bent = _straight(config, problem, lines)
-        if bent:  # what was joined last and is no line
-            problem, lines, solution = solved(problem, lines, TOLERANCE)
+        solver = _Solver(config, rules, divide(np.asarray(start.pose[:, :2])))
+        problem, lines, solution = _alternate(solver, problem, lines, frames)
         pose = problem.start.pose
         return jax.device_get(
             Smoothed(
@@ -162,10 +131,61 @@ def smooth(
                 measurements=measurements(problem.keyframes, lines),
                 problem=problem,
                 solution=solution,
-                costs=costs,
-                merged=merged,
+                costs=solver.costs,
+                merged=solver.merged,
             )
         )
+
+
+@dataclasses.dataclass
+class _Solver:
+    """What the solutions of one drive share."""
+
+    config: SlamConfig
+    rules: SmoothingConfig
+    leaf: np.ndarray  # which part of the plane each keyframe is in
+    dissection: Dissection | None = None  # the last one, whose sizes the next one keeps
+    costs: list[tuple[float, float]] = dataclasses.field(default_factory=list)
+    merged: int = 0
+
+    def solve(
+        self, problem: Problem, lines: Lines, tolerance: float, sure: bool = True
+    ) -> tuple[Problem, Lines, Solution]:
+        """The problem and the lines as they are at the solution, and the solution."""
+        self.dissection = dissect(problem.keyframes, len(lines.valid), self.leaf, self.dissection)
+        problem = eqx.tree_at(
+            lambda p: (p.anchor, p.off_floor), problem, (lines.anchor, lines.off_floor)
+        )
+        solution = solve(problem, self.dissection, sure=sure, tolerance=tolerance)
+        self.costs.append((float(solution.cost_before), float(solution.cost)))
+        return *_settled(self.config, problem, lines, solution), solution
+
+
+def _alternate(
+    solver: _Solver, problem: Problem, lines: Lines, frames: Keyframes
+) -> tuple[Problem, Lines, Solution]:
+    """Rounds of association and least squares; duplicate lines are merged in each."""
+    config, rules, solution = solver.config, solver.rules, None
+    problem = _associated(config, rules, problem, lines, frames)
+    problem, lines = apart(
+        problem, lines, float(rules.passing), int(rules.min_measurements), rules.room
+    )
+    for left in reversed(range(rules.rounds)):
+        if left < rules.rounds - 1:
+            problem = _associated(config, rules, problem, lines, frames)
+        tolerance = ROUGH if left else TOLERANCE
+        problem, lines, solution = solver.solve(problem, lines, tolerance)
+        problem, lines, bent = _straight(config, problem, lines)
+        shown = measurements(problem.keyframes, lines)
+        into, joins = duplicates(lines, solution.marginals, shown)
+        if bent or joins.any():
+            solver.merged += int(joins.sum())
+            problem, lines = renamed(problem, lines, representatives(into, joins))
+            problem, lines, solution = solver.solve(problem, lines, tolerance, sure=left == 0)
+    problem, lines, bent = _straight(config, problem, lines)
+    if bent or solution is None:  # what was joined last and is no line
+        problem, lines, solution = solver.solve(problem, lines, TOLERANCE)
+    return problem, lines, solution
 
 
 def _priors(config: SlamConfig, rules: SmoothingConfig) -> Priors:
@@ -178,14 +198,6 @@ def _priors(config: SlamConfig, rules: SmoothingConfig) -> Priors:
     )
 
 
-def _in_double(tree):
-    def one(leaf):
-        leaf = np.asarray(leaf)
-        return jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
-
-    return jax.tree.map(one, tree)
-
-
 def _lines_of_map(rules: MapConfig, m: SegmentMap, smoothing: SmoothingConfig) -> Lines:
     """The map's lines that were seen often enough to be worth a solution."""
     live = np.flatnonzero(np.asarray(m.valid & (m.updates >= int(smoothing.min_measurements))))
@@ -195,7 +207,7 @@ def _lines_of_map(rules: MapConfig, m: SegmentMap, smoothing: SmoothingConfig) -
 
 
 @jax.jit
-def _chosen(rules, m, slots, count):
+def _chosen(rules: MapConfig, m: SegmentMap, slots: Array, count: Array | int) -> Lines:
     m = jax.tree.map(lambda a: a[slots], m)
     off_floor = is_off_floor(rules, m.line, m.covariance)
     line = jnp.where(off_floor[:, None], m.line, jax.vmap(on_floor)(m.line, m.covariance))
@@ -215,7 +227,7 @@ def _associated(
     """With the lines that the segments of `frames` show by the present estimate, and only those."""
     line, known = _shown(
         rules.seeing, config.filter.max_depth, config.sensor.upright, problem.camera, problem.mount,
-        lines, problem.start, frames.segments_image, frames.driven,
+        lines, problem.start, frames,
     )  # fmt: skip
     frames = eqx.tree_at(lambda f: (f.line, f.known), frames, (line, known))
     most = int(known.sum(axis=1).max())
@@ -231,30 +243,20 @@ _narrowed = jax.jit(kf.narrowed, static_argnums=1)
 _shown = jax.jit(associate)
 
 
-def _solved(
-    config, rules, problem: Problem, lines: Lines, dissection: Dissection, tolerance, sure=True
-):
-    """The problem as it stands at its solution, the lines as they are and lie by it, and that."""
-    problem = eqx.tree_at(
-        lambda p: (p.anchor, p.off_floor), problem, (lines.anchor, lines.off_floor)
-    )
-    solution = solve(problem, dissection, sure=sure, tolerance=tolerance)
-    return *_settled(config, rules, problem, lines, solution), solution
-
-
 @jax.jit
-def _settled(config, rules, problem, lines, solution):
+def _settled(
+    config: SlamConfig, problem: Problem, lines: Lines, solution: Solution
+) -> tuple[Problem, Lines]:
     m = config.segment_map
     apparent_scale, sigma = solution.scale_free, solution.scale_sigma
-    outside = (apparent_scale > m.scale_above) | (apparent_scale < m.scale_below)
-    # what is not known to be the floor's, as of a baseboard passed by, must not hold the poses
-    off_floor = outside & (jnp.abs(apparent_scale - 1) > m.scale_gate * sigma)
-    undetermined = ~off_floor & (sigma > rules.scale_known)
+    off_floor = scale_is_off_floor(m, apparent_scale, sigma)
+    # a line that may not be the floor's, as the top of a baseboard passed by, must not hold poses
+    undetermined = ~off_floor & (sigma > m.scale_held)
     off_floor = off_floor | undetermined
     line = jnp.where(off_floor[:, None], solution.unknowns.line, solution.on_floor)
     unknowns = eqx.tree_at(lambda u: u.line, solution.unknowns, line)
     problem = eqx.tree_at(lambda p: p.start, problem, unknowns)
-    problem = _believed(config, problem)
+    problem = _with_pixel_sigma(config, problem)
     reach, seen = reaches(problem, m.range)
     reach = jnp.where(seen[:, None], reach, lines.reach)
     return problem, Lines(
@@ -262,49 +264,13 @@ def _settled(config, rules, problem, lines, solution):
     )
 
 
-def _believed(config, problem: Problem) -> Problem:
+def _with_pixel_sigma(config: SlamConfig, problem: Problem) -> Problem:
     """The pixels are trusted less where they disagree more than they should."""
     sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
     return eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
 
 
 @jax.jit
-def _straight(config, problem: Problem, lines: Lines):
+def _straight(config: SlamConfig, problem: Problem, lines: Lines) -> tuple[Problem, Lines, Array]:
     problem, lines, bent = without_bent(problem, lines)
-    return _believed(config, problem), lines, bent
-
-
-def final_map(config: SlamConfig, rules: SmoothingConfig, smoothed: Smoothed) -> FinalMap:
-    """The lines seen often enough that are the floor's; with the height that each would have."""
-    solution = smoothed.solution
-    apparent_scale, sigma = solution.scale_free, solution.scale_sigma
-    often = smoothed.measurements >= config.segment_map.min_updates
-    with jax.enable_x64(True):
-        found = FinalMap(
-            endpoints_world=jnp.asarray(smoothed.endpoints_world),
-            is_floor=jnp.asarray(
-                often & shown(config.segment_map, rules, smoothed.lines, apparent_scale, sigma)
-            ),
-            updates=jnp.asarray(smoothed.measurements),
-            height=jnp.asarray(smoothed.mount.height * (1 - 1 / apparent_scale)),
-            height_sigma=jnp.asarray(smoothed.mount.height * sigma / apparent_scale**2),
-        )
-        return jax.device_get(found)
-
-
-def shown(
-    m: MapConfig,
-    rules: SmoothingConfig,
-    lines: Lines,
-    apparent_scale: Float[Array | np.ndarray, "K"],
-    sigma: Float[Array | np.ndarray, "K"],
-) -> Bool[Array | np.ndarray, "K"]:
-    """The lines whose height is known, and known to be the floor's.
-
-    What runs along the way of the robot hardly changes its magnification: the top of a baseboard
-    that was only ever passed by is neither told from the floor nor shown. What is nearly known, and
-    would be the floor's, is.
-    """
-    inside = (apparent_scale > m.scale_below) & (apparent_scale < m.scale_above)
-    floor = ~lines.off_floor | (lines.undetermined & inside)
-    return lines.valid & floor & (sigma < rules.scale_shown)
+    return _with_pixel_sigma(config, problem), lines, bent

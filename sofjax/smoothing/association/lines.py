@@ -10,9 +10,9 @@ from sofjax.geometry.camera import Camera, Mount
 from sofjax.geometry.floor import floor_homography, may_be_upright, segment_to_floor
 from sofjax.geometry.lines import PolarLine, cofactor, direction, line_point_distance, normal
 from sofjax.geometry.se2 import SE2
-from sofjax.geometry.segments import Segments, overlap
+from sofjax.geometry.segments import overlap
 from sofjax.segment_map import predict_measurement
-from sofjax.smoothing.problem import Unknowns, corrected, foot_mount
+from sofjax.smoothing.problem import Keyframes, Unknowns, corrected, foot_mount
 
 
 class Lines(eqx.Module):
@@ -59,22 +59,21 @@ class Seeing(eqx.Module):
 
 def associate(
     seeing: Seeing, max_depth: Float[Array, ""] | float, upright_gate: Float[Array, ""] | float,
-    camera: Camera, mount: Mount, lines: Lines, unknowns: Unknowns, segments_image: Segments,
-    driven: Float[Array, "n"],
+    camera: Camera, mount: Mount, lines: Lines, unknowns: Unknowns, frames: Keyframes,
 ) -> tuple[Int[Array, "n M"], Bool[Array, "n M"]]:  # fmt: skip
     """For each segment of each keyframe the line that lies nearest to both of its ends, in pixels.
 
     **Arguments:**
     - `max_depth`: metres; what is farther is not used.
     - `upright_gate`: pixels, of `may_be_upright`; what may be shows no line.
-    - `driven`: metres, at each keyframe.
+    - `unknowns`: their poses and jitters, about `mount`.
 
     **Returns:** the line's index, and whether there is one within the gates.
     """
     mount = corrected(mount, unknowns.shared)
     K, ends_world = lines.valid.shape[0], lines.endpoints_world
 
-    def of_keyframe(each):
+    def of_keyframe(each: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
         pose, endpoints, valid, driven = each
         T_world_nadir = SE2(pose[:2], pose[2]) @ mount.T_robot_nadir
         H_F = floor_homography(camera, foot_mount(mount, pose), SE2.identity())
@@ -109,7 +108,8 @@ def associate(
         off = jnp.where(possible, first**2 + second**2, jnp.inf)
         return near[off.argmin(axis=1)], possible.any(axis=1)
 
-    each = (unknowns.pose, segments_image.endpoints, segments_image.valid, driven)
+    segments = frames.segments_image
+    each = (unknowns.pose, segments.endpoints, segments.valid, frames.driven)
     return jax.lax.map(of_keyframe, each, batch_size=8)
 
 

@@ -44,16 +44,20 @@ class Factors(eqx.Module):
         return Unknowns(pose.reshape(right.pose.shape), line.reshape(right.line.shape), shared)
 
 
+def _condense(
+    F: Float[Array, "f f"], own: Int[Array, "a"], size: int
+) -> tuple[Array, Array, Array]:
+    """The pivot block's factor, its ties to the front, and the front without it."""
+    a = own.shape[0]
+    A = F[:a, :a] + jnp.diag((own == size).astype(F.dtype))
+    factor = jnp.linalg.cholesky(A, symmetrize_input=False)
+    ties = solve_triangular(factor, F[:a, a:], lower=True)
+    return factor, ties, F[a:, a:] - ties.T @ ties
+
+
 def eliminate(blocks: Blocks, dissection: Dissection) -> Factors:
     """From the leaves to the root."""
     leaves, generations = dissection.leaves, dissection.generations
-
-    def condense(F, own):
-        a = own.shape[0]
-        A = F[:a, :a] + jnp.diag((own == dissection.size).astype(F.dtype))
-        factor = jnp.linalg.cholesky(A, symmetrize_input=False)
-        ties = solve_triangular(factor, F[:a, a:], lower=True)
-        return factor, ties, F[a:, a:] - ties.T @ ties
 
     with_none = lambda a: jnp.concatenate([a, jnp.zeros((1, *a.shape[1:]), a.dtype)])
     seen = blocks.seen.reshape(-1, POSE, LINE)
@@ -65,7 +69,7 @@ def eliminate(blocks: Blocks, dissection: Dissection) -> Factors:
     width = sum(generations[0].own.shape[1:] + generations[0].border.shape[1:])
     plus = lambda start, count: start[..., None] + jnp.arange(count)
 
-    def of_leaf(each):
+    def of_leaf(each: tuple) -> tuple[Array, Array, Array]:
         leaf, own, is_first = each
         i, k = leaf.frame, leaf.line
         poses, mine = plus(leaf.here, POSE), plus(leaf.line_at, LINE)  # [c, 5] and [P, 3]
@@ -83,9 +87,9 @@ def eliminate(blocks: Blocks, dissection: Dissection) -> Factors:
             rows, columns = rows[..., :, None], columns[..., None, :]
             F = F.at[rows, columns].add(value, mode="drop")
             F = F.at[columns, rows].add(value, mode="drop")
-        return condense(F, own)
+        return _condense(F, own, dissection.size)
 
-    def of_node(each):
+    def of_node(each: tuple) -> tuple[Array, Array, Array]:
         own, border, above, below = each
         width = own.shape[0] + border.shape[0]
         F = jnp.zeros((width, width))
@@ -94,7 +98,7 @@ def eliminate(blocks: Blocks, dissection: Dissection) -> Factors:
             place = jnp.full(width, q).at[at].set(jnp.arange(q), mode="drop")
             H = jnp.pad(H, (0, 1))
             F = F + H[place][:, place]
-        return condense(F, own)
+        return _condense(F, own, dissection.size)
 
     is_first = jnp.arange(leaves.frame.shape[0]) == 0
     found = jax.lax.map(of_leaf, (leaves, generations[0].own, is_first.astype(pose.dtype)))
