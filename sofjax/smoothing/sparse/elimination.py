@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sofjax.smoothing.problem import LINE, POSE, SHARED, Keyframes, Unknowns
 from sofjax.smoothing.sparse.blocks import Blocks, Jacobian
