@@ -32,7 +32,9 @@ def in_any_run(condition: Bool[Array, ""]) -> Bool[Array, ""]:
 
 
 @in_any_run.def_vmap
-def _of_batch(axis_size, in_batched, condition):
+def _of_batch(
+    axis_size: int, in_batched: list[bool], condition: Bool[Array, "batch"]
+) -> tuple[Bool[Array, ""], bool]:
     return in_any_run(condition.any()), False
 
 

@@ -84,7 +84,7 @@ def score(
     across = rules.sigma**2 + (slack[0] / 2) ** 2
     along = rules.angle**2 + (slack[2] / 2) ** 2
 
-    def of_move(move):
+    def of_move(move: Array) -> tuple[Array, ...]:
         moved = SE2(move[:2], move[2]).apply(later)
         middle = moved.mean(axis=1)
         theta = jax.vmap(polar_through)(moved).theta
@@ -131,7 +131,7 @@ def find(
     moves, step = hypotheses(rules, sigma)
     value, _, _ = ask(moves, step)
 
-    def refined(move):
+    def refined(move: Array) -> tuple[Array, ...]:
         """The best move about one, to a sixteenth of the spacing; and what `score` says of it."""
         for spacing in (step / 4, step / 16):
             ticks = [s * np.arange(-4, 5) for s in spacing]

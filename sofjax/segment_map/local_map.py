@@ -57,7 +57,7 @@ def nearby(
     L = min(most or config.nearby, K)
     there = segment_map.valid & (segment_map.unseen <= config.recall)
 
-    def nearest():
+    def nearest() -> tuple[Bool[Array, "K"], Int[Array, ""]]:
         ends = segment_map.segments_world.endpoints - T_world_nadir.xy
         x, y = ends[:, 0, 0], ends[:, 0, 1]
         u, v = ends[:, 1, 0] - x, ends[:, 1, 1] - y

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike
 
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.se2 import SE2
@@ -61,7 +62,7 @@ def filled(index: np.ndarray, size: int) -> np.ndarray:
 
 
 @jax.jit
-def _gather(log, index, count):
+def _gather(log: Observation, index: Array | np.ndarray, count: ArrayLike) -> Keyframes:
     motion = log.motion
     identity = SE2(jnp.zeros(2, motion.xy.dtype), jnp.zeros((), motion.yaw.dtype))
     _, poses = jax.lax.scan(lambda T, m: (T @ m, T @ m), identity, motion)
@@ -94,7 +95,7 @@ def carry(T_world_robot: SE2, index: np.ndarray, smoothed: SE2) -> SE2:
 
 
 @jax.jit
-def _carry(T_world_robot, index, count, smoothed):
+def _carry(T_world_robot: SE2, index: Array | np.ndarray, count: ArrayLike, smoothed: SE2) -> SE2:
     t = jnp.arange(T_world_robot.yaw.shape[0])
     i = jnp.clip(jnp.searchsorted(index, t, side="right") - 1, 0, count - 2)
     width = jnp.maximum(index[i + 1] - index[i], 1).astype(T_world_robot.yaw.dtype)

@@ -135,7 +135,7 @@ def distances(unknowns: Unknowns, problem: Problem) -> Float[Array, "n M 2"]:
     """Of the ends of each segment from the line that it shows, pixels; zero if it shows none."""
     k = problem.keyframes
 
-    def of_keyframe(pose, endpoints, index, known):
+    def of_keyframe(pose: Array, endpoints: Array, index: Array, known: Array) -> Array:
         of_segment = lambda segment, j: pixel_residual(
             problem, pose, unknowns.line[j], unknowns.shared,
             jax.tree.map(lambda a: a[j], problem.anchor), segment,

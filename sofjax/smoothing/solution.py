@@ -1,5 +1,8 @@
 """The least-squares solution and how sure it is."""
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,7 +52,8 @@ class Solution(eqx.Module):
 
 
 def _cost(r: Residuals) -> Float[Array, ""]:
-    return 0.5 * sum(jnp.sum(part**2) for part in jax.tree.leaves(r))
+    parts = [jnp.sum(part**2) for part in jax.tree.leaves(r)]
+    return 0.5 * sum(parts[1:], start=parts[0])
 
 
 def solve(
@@ -84,9 +88,10 @@ def _solve(
     sure: Bool[Array, ""],
     tolerance: Float[Array, ""],
 ) -> Solution:
+    traced: Any = tolerance  # optimistix takes arrays where it says float
     solver = optx.LevenbergMarquardt(
-        rtol=tolerance,
-        atol=tolerance,
+        rtol=traced,
+        atol=traced,
         norm=_norm,
         linear_solver=DissectionSolver(problem.keyframes, dissection),
     )
@@ -116,7 +121,7 @@ def _solve(
     )
 
 
-def _if(wanted, make):
+def _if(wanted: Bool[Array, ""], make: Callable[[], Any]) -> Any:
     """What `make` makes, or zeros in its place."""
     zeros = lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(make))
     return jax.lax.cond(wanted, make, zeros)

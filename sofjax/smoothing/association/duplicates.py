@@ -20,7 +20,7 @@ REACH, TURN = 0.4, 0.25  # metres, radians: beyond this what is likest may be a 
 MODEL = (0.004, 0.01, 0.02)  # metres, radians, the apparent scale: what no covariance knows of
 LEAST = 3  # measurements: of what is hardly seen all is possible
 GAP = 0.3  # metres between two pieces of one line
-PAIRS = 128  # told together
+PAIRS = 128  # tested jointly
 
 
 def duplicates(
@@ -76,20 +76,20 @@ def _filled(*indices: np.ndarray) -> list[np.ndarray]:
     return [np.append(a, np.zeros(PAIRS - len(a), int)) for a in indices]
 
 
-def _at(line, anchor, here):
+def _at(line: Float[Array, "3"], anchor: SE2, here: SE2) -> tuple[Array, Array]:
     """A line, and how it depends on (rho, theta, apparent scale), about a nadir."""
     line, H = predict_measurement(line, anchor, here)
     return line, jnp.concatenate([H, jnp.array([[0.0, 0.0, 1.0]], H.dtype)])
 
 
-def _difference(first, second):
-    """Of two lines (rho, theta, apparent scale), and the sides by which the second counts in it."""
+def _difference(first: Float[Array, "3"], second: Float[Array, "3"]) -> tuple[Array, Array]:
+    """The difference of two lines (rho, theta, apparent scale), and the second's signs in it."""
     a, b = PolarLine(first[0], first[1]), PolarLine(second[0], second[1])
     side = jnp.stack([alignment(a, b), jnp.ones_like(first[0]), jnp.ones_like(first[0])])
     return jnp.append(polar_difference(a, b), first[2] - second[2]), side
 
 
-def _middle(ends):
+def _middle(ends: Float[Array, "2 2"]) -> SE2:
     return SE2(ends.mean(axis=0), jnp.zeros((), ends.dtype))
 
 
@@ -100,7 +100,7 @@ def _compared(
     """Pairs (i, j) of which j may be another description of i; and pairs that lie side by side."""
     K, ends = lines.valid.shape[0], lines.endpoints_world
 
-    def of_line(j):
+    def of_line(j: Array) -> tuple[Array, Array]:
         here = _middle(ends[j])
         line, _ = jax.vmap(predict_measurement, in_axes=(0, 0, None))(
             lines.line, lines.anchor, here
@@ -148,7 +148,9 @@ def _differences(
     model = jnp.asarray(MODEL, lines.line.dtype) ** 2
     above = lines.off_floor & ~lines.undetermined
 
-    def difference(i, j, pair, by_pair, own, covariance):
+    def difference(
+        i: Array, j: Array, pair: Array, by_pair: Array, own: Array, covariance: Array
+    ) -> Difference:
         here = _middle(ends[j])
         anchor = lambda k: jax.tree.map(lambda a: a[k], lines.anchor)
         (a, A), (b, B) = _at(pair[:3], anchor(i), here), _at(pair[3:], anchor(j), here)
@@ -158,18 +160,18 @@ def _differences(
         error = by_lines @ covariance @ by_lines.T + own
         return Difference(value, by_lines, own, value @ jnp.linalg.solve(error, value))
 
-    def of_pair(i, j, covariance):
+    def of_pair(i: Array, j: Array, covariance: Array) -> Difference:
         pair = jnp.concatenate([lines.line[i], lines.line[j]])
         apparent_scale = covariance[:, 2::3]
         gain = apparent_scale @ jnp.linalg.inv(apparent_scale[2::3] + model[2] * jnp.eye(2))
         by_rest = jnp.eye(6).at[:, 2::3].add(-gain)
         free = difference(i, j, pair, jnp.eye(6), jnp.zeros((6, 6)), covariance)
-        told = model[2] * gain @ gain.T
-        on_floor = difference(i, j, pair + gain @ (1 - pair[2::3]), by_rest, told, covariance)
+        spread = model[2] * gain @ gain.T
+        on_floor = difference(i, j, pair + gain @ (1 - pair[2::3]), by_rest, spread, covariance)
         lie = ~(above[i] | above[j]) & (on_floor.squared > free.squared)
         return jax.tree.map(partial(jnp.where, lie), on_floor, free)
 
-    return jax.vmap(of_pair)(i, j, covariance)
+    return jax.vmap(of_pair)(jnp.asarray(i), jnp.asarray(j), covariance)
 
 
 @jax.jit

@@ -24,11 +24,13 @@ def places(
     u, frames = problem.start, problem.keyframes
     mount = corrected(problem.mount, u.shared)
 
-    def of_keyframe(pose, endpoints, index, known):
+    def of_keyframe(
+        pose: Array, endpoints: Array, index: Array, known: Array
+    ) -> tuple[Array, Array]:
         T_world_nadir = SE2(pose[:2], pose[2]) @ mount.T_robot_nadir
         H_F = floor_homography(problem.camera, foot_mount(mount, pose), SE2.identity())
 
-        def of_segment(ends, k):
+        def of_segment(ends: Array, k: Array) -> tuple[Array, Array]:
             line = u.line[k]
             on_floor, some = segment_to_floor(H_F, ends, jnp.asarray(radius, ends.dtype))
             # an off-floor line is seen magnified about the nadir

@@ -17,11 +17,11 @@ def compatible(
     S: Float[np.ndarray, "pairs 3 pairs 3"],
     rivals: Bool[np.ndarray, "pairs pairs"],
 ) -> list[int]:
-    """Pairs that are one, each the best borne out by all others that are left.
+    """Pairs that are one, chosen in turn: the one that all pairs that are left support best.
 
-    What a pair bears out of another is how much likelier its difference is by the first being one;
-    a pair is left undecided while one that excludes it is borne out as well. One beyond the gate
-    is not chosen, but may be borne out and bears out others: once these are one it may be within.
+    A pair supports another by as much as its being one makes the other's difference likelier. A
+    pair stays undecided while a pair that excludes it is supported as well. A pair beyond the gate
+    is not chosen, but it counts: once others are one it may be within the gate.
 
     **Arguments:**
     - `d`: differences of the two of each pair.
@@ -41,8 +41,8 @@ def compatible(
         support, excludes = _support(d, S, rivals)
         none = _of_rivals(np.maximum(GATE**2 - e, 0)[None], rivals)  # if no more are one
         within = e < GATE**2
-        borne = within | (support > none + GATE**2)
-        other = np.where(excludes & borne, support, -np.inf).max(axis=1)
+        supported = within | (support > none + GATE**2)
+        other = np.where(excludes & supported, support, -np.inf).max(axis=1)
         clear = within & (support > other + GATE**2)
         if not clear.any():
             return chosen
@@ -56,19 +56,23 @@ def compatible(
         index, d, S, rivals = index[keep], d[keep], S[keep][:, :, keep], rivals[keep][:, keep]
 
 
-def _own(S):
+def _own(S: np.ndarray) -> np.ndarray:
+    """[p, 3, 3] Each pair's own covariance."""
     n = np.arange(len(S))
     return S[n, :, n]
 
 
-def _squared(d, own):
+def _squared(d: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis distances."""
     return np.einsum("...i,...i->...", d, np.linalg.solve(own, d[..., None])[..., 0])
 
 
-def _support(d, S, rivals):
-    """Of each pair [h] twice the log-likelihood that it adds if it is one: its own and that of all
-    that it bears out, where a pair at the gate adds nothing; and the pairs [h, p] that it excludes,
-    which are its rivals and what is then beyond WIDE.
+def _support(d: np.ndarray, S: np.ndarray, rivals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The support of each pair [h], and the pairs [h, p] that it excludes.
+
+    The support is twice the log-likelihood that the pair adds if it is one: its own, and that of
+    all pairs that it makes likelier; a pair at the gate adds nothing. It excludes its rivals, and
+    what is then beyond WIDE.
     """
     own, itself = _own(S), np.eye(len(d), dtype=bool)
     gain = np.einsum("hij,hjqk->hiqk", np.linalg.inv(own), S)
@@ -76,13 +80,13 @@ def _support(d, S, rivals):
     S_given = own - np.einsum("hiqj,hiqk->hqjk", S, gain)
     S_given[itself] = own
     e = np.where(itself, _squared(d, own), _squared(d_given, S_given))
-    told = np.linalg.slogdet(own)[1] - np.linalg.slogdet(S_given)[1]
+    narrowed = np.linalg.slogdet(own)[1] - np.linalg.slogdet(S_given)[1]
     excludes = rivals | (e > WIDE**2)  # of hundreds of true pairs some are beyond the gate
-    value = np.where(excludes, 0, np.maximum(GATE**2 - e + told, 0))
+    value = np.where(excludes, 0, np.maximum(GATE**2 - e + narrowed, 0))
     return _of_rivals(value, rivals), excludes
 
 
-def _of_rivals(value, rivals):
+def _of_rivals(value: np.ndarray, rivals: np.ndarray) -> np.ndarray:
     """The sum of the values [h, pairs], of rivals the best one alone."""
     best = (value[:, :, None] >= value[:, None, :]) | ~rivals
     return np.where(best.all(axis=2), value, 0).sum(axis=1)

@@ -1,5 +1,7 @@
 """The Jacobian and the normal equations block by block, from a few products J v."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,7 +37,7 @@ class Jacobian(eqx.Module):
     prior: Float[Array, "K 3 3"]  # of the lines
 
     @staticmethod
-    def of(mv, like: Unknowns) -> "Jacobian":
+    def of(mv: Callable[[Unknowns], Residuals], like: Unknowns) -> "Jacobian":
         """Of the operator `mv`, v to J v.
 
         As no residual knows two keyframes, bar neighbours, nor two lines, one product with ones in

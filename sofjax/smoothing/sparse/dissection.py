@@ -94,9 +94,11 @@ def dissect(
     first = np.cumsum(size) - size
     known = _known(leaf, line, K, BRANCH**height)
     end = _ends(known, height)
-    generations, inside, above = [], [known], None
+    generations: list[Generation] = []
+    inside: list[np.ndarray] = [known]
+    above = np.zeros((0, 0), int)
     for _ in range(height):
-        inside.append(inside[-1].reshape(-1, BRANCH, len(size)).any(axis=1))
+        inside.append(np.asarray(inside[-1].reshape(-1, BRANCH, len(size)).any(axis=1)))
     for h in reversed(range(height + 1)):
         own = [np.flatnonzero(node & (end == h)) for node in inside[h]]
         border = [np.flatnonzero(node & (end > h)) for node in inside[h]]
@@ -107,7 +109,7 @@ def dissect(
         for row, mine, others in zip(place, own, border, strict=True):
             row[mine] = np.cumsum(size[mine]) - size[mine]
             row[others] = a + np.cumsum(size[others]) - size[others]
-        parents = np.zeros((1, len(size) + 1), int) if above is None else above
+        parents = above if len(above) else np.zeros((1, len(size) + 1), int)
         in_parent = np.repeat(parents, BRANCH, axis=0)[: len(own)]
         rows = lambda variables, starts, width, none: jnp.asarray(np.stack([
             _filled(_unknowns(start[v], size[v]), width, none)
@@ -126,7 +128,7 @@ def dissect(
     return Dissection(leaves, tuple(generations), *jax.tree.map(jnp.asarray, (poses, lines)))
 
 
-def _known(leaf, line, K, C) -> Bool[np.ndarray, "C variables"]:
+def _known(leaf: np.ndarray, line: np.ndarray, K: int, C: int) -> Bool[np.ndarray, "C variables"]:
     """Which variables each leaf knows; of a line that nobody sees some leaf must."""
     n = len(leaf)
     known = np.zeros((C, n + K + 1), bool)
@@ -139,7 +141,7 @@ def _known(leaf, line, K, C) -> Bool[np.ndarray, "C variables"]:
     return known
 
 
-def _ends(known, height) -> Int[np.ndarray, "variables"]:
+def _ends(known: np.ndarray, height: int) -> Int[np.ndarray, "variables"]:
     """The height of the lowest node above all leaves that know a variable; of what all share, that
     of the root.
     """
@@ -151,8 +153,10 @@ def _ends(known, height) -> Int[np.ndarray, "variables"]:
     return end
 
 
-def _leaves(leaf, line, home, place, before: Leaves | None) -> Leaves:
-    """**Arguments:** `place` [C, variables + 1] in each leaf, the last of them that of none."""
+def _leaves(
+    leaf: np.ndarray, line: np.ndarray, home: np.ndarray, place: np.ndarray, before: Leaves | None
+) -> Leaves:
+    """The leaves; `place` [C, variables + 1] is in each of them, the last that of none."""
     (n, M), K, C = line.shape, len(home), len(place)
     of_leaf = np.arange(C)[:, None]
     table = lambda rows, width, none: np.stack([_filled(row, width, none) for row in rows])

@@ -6,6 +6,7 @@ multifrontal solution of indefinite sparse symmetric linear equations (1983).
 """
 
 from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -119,10 +120,12 @@ class DissectionSolver(lx.AbstractLinearSolver):
     keyframes: Keyframes
     dissection: Dissection
 
-    def init(self, operator, options):
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
         return operator
 
-    def compute(self, state, vector, options):
+    def compute(
+        self, state: Any, vector: Any, options: dict[str, Any]
+    ) -> tuple[Unknowns, lx.RESULTS, dict[str, Any]]:
         operator = state
         residual, _ = vector
         like = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), operator.in_structure())
@@ -135,11 +138,11 @@ class DissectionSolver(lx.AbstractLinearSolver):
         factors = eliminate(J.blocks(self.keyframes, root**2), self.dissection)
         return factors.solve(right), lx.RESULTS.successful, {}
 
-    def transpose(self, state, options):
+    def transpose(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         raise NotImplementedError("a least-squares solver has no transpose here")
 
-    def conj(self, state, options):
+    def conj(self, state: Any, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         return state, options
 
-    def assume_full_rank(self):
+    def assume_full_rank(self) -> bool:
         return True

@@ -53,7 +53,7 @@ class Marginals(eqx.Module):
             met = met | meet
         return found
 
-    def _lifted(self, height, each):
+    def _lifted(self, height: int, each: tuple[Array, Array]) -> Array:
         """A combination of what a node knows as one of what its parent knows."""
         row, node = each
         above = self.factors.dissection.generations[height].above
@@ -72,7 +72,7 @@ def marginals(factors: Factors) -> Marginals:
         list(zip(d.generations, factors.factor, factors.ties, strict=True))
     ):
 
-        def of_node(each, parents=parents):
+        def of_node(each: tuple[Array, ...], parents: Array = parents) -> Array:
             L, E, above, node = each
             parent = jnp.pad(parents[node // BRANCH], (0, 1))
             at = jnp.minimum(above, parent.shape[0] - 1)
