@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -192,6 +193,16 @@ def test_what_a_choice_of_loop_implies_does_not_outlive_it(tmp_path):
     # what the user has chosen stays
     own = parsed("--loop", "paper", "--set", "segment_map.recall=99")
     assert own.used.slam.segment_map.recall == 99
+
+
+def test_a_setting_that_was_learned_is_a_number_in_the_file(tmp_path):
+    learned = lambda value: RunSettings(
+        slam=eqx.tree_at(lambda c: c.sensor.pixel_sigma, PRESETS["default"], jnp.float32(value))
+    )
+    (tmp_path / "c.toml").write_text(to_toml(to_dict(learned(0.75))))
+    assert gather(tmp_path / "c.toml").slam.sensor.pixel_sigma == 0.75
+    with pytest.raises(ValueError, match=r"pixel_sigma' is nan; it must be finite"):
+        learned(jnp.nan)
 
 
 def test_settings_are_read_back_number_for_number(tmp_path):
