@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,7 @@ from sofjax.io.errors import InputError
 from sofjax.io.settings import read_toml, to_dict, to_toml, with_settings
 from sofjax.pipeline import RunSettings
 from sofjax.pipeline.settings import CHOICES, LIMITS, gather
-from sofjax.segment_map import final_map
+from sofjax.segment_map import MapConfig, final_map, is_shown
 from sofjax.vision import DETECTORS, Frontend, FrontendSettings, detect_lsd
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"
@@ -101,6 +102,19 @@ def test_every_number_reaches_the_results():
     }
     assert read.isdisjoint(others)
     assert read | others == set(to_dict(RunSettings()))
+
+
+def test_the_final_map_of_the_default_run_reads_its_rule():
+    """The smoother's map is decided by `is_shown` too; see test_classify.py."""
+    config, lines = MapConfig(), jnp.ones(3, int)
+    leaves, tree = jax.tree.flatten(config)
+    rule = lambda leaves: is_shown(
+        jax.tree.unflatten(tree, leaves), jnp.ones(3), jnp.ones(3), lines, lines
+    )
+    _, used = dce_jaxpr(jax.make_jaxpr(rule)(leaves).jaxpr, [True])
+    names = zip(names_of_leaves(config), used, strict=True)
+    scale = {f"scale_{name}" for name in ("above", "below", "gate", "known", "held")}
+    assert {name for name, is_used in names if is_used} == scale | {"min_updates", "min_share"}
 
 
 @functools.cache
@@ -192,6 +206,16 @@ def test_what_a_choice_of_loop_implies_does_not_outlive_it(tmp_path):
     # what the user has chosen stays
     own = parsed("--loop", "paper", "--set", "segment_map.recall=99")
     assert own.used.slam.segment_map.recall == 99
+
+
+def test_a_setting_that_was_learned_is_a_number_in_the_file(tmp_path):
+    learned = lambda value: RunSettings(
+        slam=eqx.tree_at(lambda c: c.sensor.pixel_sigma, PRESETS["default"], jnp.float32(value))
+    )
+    (tmp_path / "c.toml").write_text(to_toml(to_dict(learned(0.75))))
+    assert gather(tmp_path / "c.toml").slam.sensor.pixel_sigma == 0.75
+    with pytest.raises(ValueError, match=r"pixel_sigma' is nan; it must be finite"):
+        learned(jnp.nan)
 
 
 def test_settings_are_read_back_number_for_number(tmp_path):

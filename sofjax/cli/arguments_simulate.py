@@ -70,7 +70,8 @@ def _add_robot(parser: argparse.ArgumentParser) -> None:
     robot = parser.add_argument_group("the robot")
     robot.add_argument("--speed", metavar="M/S", type=float, help="metres a second; default 0.7")
     robot.add_argument(
-        "--wobble",
+        "--jitter",
+        "--wobble",  # its first name
         dest="jitter",
         metavar="RAD/S",
         type=float,

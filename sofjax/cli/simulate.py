@@ -14,6 +14,12 @@ if TYPE_CHECKING:
 
     from sofjax.simulation import Imaging, RobotSetup
 
+USUAL_SIZE = 320, 240  # pixels
+SMALLEST, LARGEST = (32, 24), (4096, 4096)  # pixels
+FOCAL = 0.2, 20.0  # widths of the image
+LARGEST_TURN, LARGEST_OTHER = 180, 90  # degrees of roll and yaw; degrees of pitch and metres
+NEAREST = 0.1  # metres between waypoints
+
 
 def run(args: argparse.Namespace) -> int:
     """Make the world, drive, draw, write."""
@@ -53,18 +59,19 @@ def choose_setup(args: argparse.Namespace) -> "RobotSetup":
     for name in ("height", "pitch", "roll", "yaw", "x", "y"):
         value = getattr(args, name)
         if value is not None:
-            if not np.isfinite(value) or abs(value) > (180 if name in ("roll", "yaw") else 90):
+            if not np.isfinite(value) or abs(value) > _limit(name):
                 raise InputError(f"--{name} is {value:g}; that is no place for a camera")
             metric = np.radians(value) if name in ("pitch", "roll", "yaw") else value
             mount = eqx.tree_at(
                 lambda m, name=name: getattr(m, name), mount, jnp.asarray(metric, float)
             )
     width, height = _size(args.size)
-    usual = float(setup.camera_file.camera.K[0, 0]) * width / 320
+    usual = float(setup.camera_file.camera.K[0, 0]) * width / USUAL_SIZE[0]
     focal = usual if args.focal is None else args.focal
-    if not 0.2 * width <= focal <= 20 * width:
+    least, most = (share * width for share in FOCAL)
+    if not least <= focal <= most:
         raise InputError(
-            f"--focal is {focal:g} px; for {width} pixels it must be {0.2 * width:g} or more"
+            f"--focal is {focal:g} px; for {width} pixels it must be {least:g} or more"
         )
     distortion = setup.camera_file.distortion
     if args.distortion is not None:
@@ -83,6 +90,11 @@ def choose_setup(args: argparse.Namespace) -> "RobotSetup":
         odometer=dataclasses.replace(setup.odometer, **_odometer(args.odometer)),
         **_chosen(given),
     )
+
+
+def _limit(name: str) -> float:
+    """The largest value of a mount's field, metres or degrees."""
+    return LARGEST_TURN if name in ("roll", "yaw") else LARGEST_OTHER
 
 
 def _chosen(given: dict[str, float | None]) -> dict[str, float]:
@@ -112,12 +124,12 @@ def _odometer(pairs: list[str]) -> dict[str, float]:
 
 def _size(text: str | None) -> tuple[int, int]:
     if text is None:
-        return 320, 240
+        return USUAL_SIZE
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(re.fullmatch("[0-9]{1,9}", part) for part in parts):
         raise InputError(f"--size is {quoted(text)}; it must be like 640x480")
     width, height = map(int, parts)
-    if not (32 <= width <= 4096 and 24 <= height <= 4096):
+    if not (SMALLEST[0] <= width <= LARGEST[0] and SMALLEST[1] <= height <= LARGEST[1]):
         raise InputError(f"--size is {quoted(text)}; it must be from 32x24 to 4096x4096")
     return width, height
 
@@ -129,7 +141,7 @@ def _way(text: str) -> "np.ndarray":
     if len(points) < 2 or any(len(point) != 2 for point in points):
         raise InputError("--way must be two points 'x,y x,y' or more, in metres")
     way = np.array(points)
-    if (np.linalg.norm(np.diff(way, axis=0), axis=1) < 0.1).any():
+    if (np.linalg.norm(np.diff(way, axis=0), axis=1) < NEAREST).any():
         raise InputError("--way has two points within 0.1 m of each other; leave one out")
     return way
 

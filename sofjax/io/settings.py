@@ -89,8 +89,8 @@ def _leaves(config: Any, prefix: str) -> Iterator[tuple[str, Setting]]:
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             yield from _leaves(value, _below(field, prefix))
-        else:
-            yield prefix + field.name, value
+        else:  # a setting that was learned may be an array
+            yield prefix + field.name, value.item() if hasattr(value, "item") else value
 
 
 def _replace(config: Config, values: Mapping[str, Setting], prefix: str) -> Config:

@@ -168,7 +168,7 @@ def _check_moves(drive: Drive) -> None:
 def _in_float64(tree: Tree) -> Tree:
     """The same arrays, floats in float64; wants `enable_x64`."""
 
-    def double(leaf: np.ndarray) -> jax.Array:
+    def double(leaf: jax.Array | np.ndarray) -> jax.Array:
         leaf = np.asarray(leaf)
         return jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
 

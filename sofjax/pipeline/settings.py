@@ -1,6 +1,7 @@
 """The settings of a run: presets, files and options, and what no run can use."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -74,6 +75,8 @@ def _what_is_right(name: str, value: Setting) -> str:
     if choices is not None:
         return "" if value in choices else f"be {' or '.join(choices)}"
     assert not isinstance(value, str), name
+    if isinstance(value, float) and not math.isfinite(value):
+        return "be finite"
     if value < 0:
         return "not be negative"
     low, high = LIMITS.get(name, (value, value))

@@ -1,4 +1,4 @@
-"""Sentences on what a drive and its run betray: worth a look, no reason to refuse."""
+"""Sentences on what looks wrong in a drive or its run: worth a look, no reason to refuse."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -21,14 +21,17 @@ ENOUGH = 100  # ... if there are so many
 FAR_OFF = 1.4  # times the height that was given, either way
 ALIKE = 0.9  # of the share of the best explanation: another that may be it
 MORE = 1.3  # times as many, and as large a share, are explained by what is wrong
-SIGMAS = 5.0  # of its prior, beyond which a learned error of the odometer is no error of one
-HOLE = 1.0  # seconds without an image that are told one by one
-MANY = 5  # holes that are told
+SIGMAS = 5.0  # of its prior, beyond which a learned error is larger than odometers have
+HOLE = 1.0  # seconds without an image, from which on a gap is named
+MANY = 5  # gaps that are named one by one
+HALF, DOUBLE = (0.4, 0.6), (1.7, 2.5)  # ratios that are called so
 
 
 def set_up(config: SlamConfig, drive: Drive, log: Observation) -> list[str]:
-    """Whether far fewer segments move as the floor does than should, and which of the usual
-    mistakes explains it: with it taken back, many more do.
+    """Sentences if far fewer segments move as the floor does than should.
+
+    Each of the usual mistakes is undone in turn: one that makes many more segments move as the
+    floor does is named as the likely cause.
 
     **Arguments:**
     - `log`: observations of the drive's first images, leading T, as `vision.observations` gives.
@@ -98,12 +101,14 @@ def _usual_mistakes(odometry: Trajectory, mount: Mount) -> Iterator[tuple[str, T
 
 
 def fitted_height(fitted: float, start: float) -> list[str]:
-    """Whether a fitted height, metres, is another than a tape and the eye could have given."""
+    """A sentence if a fitted height, metres, differs from the first by more than measuring errs."""
     ratio = fitted / start
     if 1 / FAR_OFF < ratio < FAR_OFF:
         return []
     # the height is in the odometer's metres
-    reads = "half" if 0.4 < ratio < 0.6 else "double" if 1.7 < ratio < 2.5 else f"{ratio:.2g} times"
+    reads = f"{ratio:.2g} times"
+    for word, (low, high) in (("half", HALF), ("double", DOUBLE)):
+        reads = word if low < ratio < high else reads
     return [
         f"the height is {ratio:.2f} of the {start:g} m that the fit began at: does the odometer "
         f"read {reads} of the way, or was the height not measured?"
@@ -111,13 +116,13 @@ def fitted_height(fitted: float, start: float) -> list[str]:
 
 
 def of_drive(drive: Drive) -> list[str]:
-    """What reading a drive's files showed."""
+    """Sentences on what reading a drive's files showed."""
     found = camera_doubts(drive.camera_file) + drive.remarks + drive.contradictions
     return found + odometry_warnings(drive) + holes(drive.image_stamps)
 
 
 def odometer(learned: Mapping[str, float], model: MotionModel) -> list[str]:
-    """Whether errors of the odometer were learned that are beyond all that its prior allows.
+    """Sentences on errors of the odometer that were learned and are far outside their prior.
 
     **Arguments:**
     - `learned`: the errors by their names in `motion.BIAS`.

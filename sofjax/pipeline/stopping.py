@@ -1,9 +1,12 @@
 """Ctrl-C and SIGTERM: when they stop a command, and its exit code then.
 
-`main` listens while a command runs. A signal raises `KeyboardInterrupt`, but neither while a module
-is being imported (half imported, it would fail in its own ways) nor in a block of `held`: there it
-waits. Where Python swallows the exception, as in callbacks of the garbage collector, it is raised
-again a little later. Who sends a second signal is not kept waiting.
+`main` listens while a command runs. A signal raises `KeyboardInterrupt`. It waits while a module is
+being imported, since a module that is half imported cannot be used, and in a block of `held`. Where
+Python swallows the exception, as in callbacks of the garbage collector, it is raised again a little
+later. A second signal does not wait.
+
+A program that uses the library installs no handlers: there `held` and `allowed` do nothing, and
+Ctrl-C raises `KeyboardInterrupt` as usual.
 """
 
 import signal
