@@ -127,6 +127,7 @@ def calibrate_drive(
     evidence = f"{len(residuals)} of {found.related} pairs of segments taken for floor"
     evidence += ", then jointly with poses and lines" * (usable and joint)
     fields = (jnp.asarray(value, float) for value in dataclasses.astuple(fitted))
+    known = _accuracy(fitted, covariance) + f"; {doubt}" * bool(doubt)
     verdict = FitVerdict.DOUBTFUL if doubt else FitVerdict.GOOD
     return Calibration(
         drive=drive,
