@@ -133,9 +133,7 @@ def calibrate_drive(
         drive=drive,
         camera_file=dataclasses.replace(drive.camera_file, mount=type(fitted)(*fields)),
         verdict=verdict if usable else FitVerdict.NOT_USABLE,
-        sentence=_accuracy(fitted, covariance) + f"; {doubt}" * bool(doubt)
-        if usable
-        else assessment.sentence,
+        sentence=known if usable else assessment.sentence,
         evidence=evidence,
         estimates=estimates(fitted, odometer, covariance, config.fit.free),
         residual_px=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.nan,
