@@ -255,8 +255,8 @@ def test_scratch_memory_does_not_grow_with_the_images():
     assert compiled.memory_analysis().temp_size_in_bytes / DRIVES < 10 * 2**20
 
 
-def test_a_world_with_more_edges_than_room_is_refused():
-    with pytest.raises(ValueError, match="room for 8"):
+def test_a_world_with_more_edges_than_the_capacity_is_refused():
+    with pytest.raises(ValueError, match="capacity is 8"):
         Scene.of(world_of("l"), edges=8)
 
 

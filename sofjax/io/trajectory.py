@@ -180,7 +180,7 @@ def _row(stamp: float, xy: np.ndarray, yaw: float) -> str:
 class TrajectoryWriter:
     """Writes rows as they come, each one complete on the disk before the next.
 
-    The file is made with the first row. Where there is no room for a row, such as on a full disk,
+    The file is made with the first row. Where there is no space for a row, such as on a full disk,
     the file ends with the row before, and the `OSError` names the file.
     """
 
@@ -199,7 +199,7 @@ class TrajectoryWriter:
                 left = left[self._file.write(left) :]
         except OSError as error:
             with contextlib.suppress(OSError):  # what is no regular file cannot be cut
-                self._file.truncate(self._size)  # a part of the row may have had room
+                self._file.truncate(self._size)  # a part of the row may have been written
             error.filename = str(self._path)
             raise
         self._size += len(data)

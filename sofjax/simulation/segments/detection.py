@@ -104,7 +104,7 @@ def both_edges(
     homogeneous: Float[Array, "2 3"],
     part: Float[Array, "2"],
     breadth: Float[Array, ""],
-    reach: Float[Array, "2"],
+    depth_seen: Float[Array, "2"],
     blur: Float[Array, ""] | float,
 ) -> tuple[Float[Array, "2 2 2"], Bool[Array, "2"]]:
     """The two edges of a fine line, beside its middle in the image, and which of them are there.
@@ -113,19 +113,19 @@ def both_edges(
 
     **Arguments:**
     - `part`: shares (from, to) of the line that are in view.
-    - `reach`: depth in metres to which either edge is seen.
+    - `depth_seen`: depth in metres to which either edge is seen.
     """
     depth = homogeneous[:, 2]
 
-    def edge(reach: Float[Array, ""], side: Float[Array, ""]) -> tuple[Array, Array]:
-        near = where_positive(reach - depth)
+    def edge(depth_seen: Float[Array, ""], side: Float[Array, ""]) -> tuple[Array, Array]:
+        near = where_positive(depth_seen - depth)
         seen = jnp.stack([jnp.maximum(part[0], near[0]), jnp.minimum(part[1], near[1])])
         ends = project(homogeneous, seen)
         w = breadth / jnp.maximum(depth[0] + seen * (depth[1] - depth[0]), NEAREST_DEPTH)
         away = jnp.maximum(w, 1e-3) / share_left(jnp.maximum(w, 1e-3), blur) / 2
         return ends + side * away[:, None] * normal_of(ends)[None], seen[1] > seen[0]
 
-    ends, there = jax.vmap(edge)(reach, jnp.array([1.0, -1.0]))
+    ends, there = jax.vmap(edge)(depth_seen, jnp.array([1.0, -1.0]))
     return jnp.stack([ends[0], ends[1, ::-1]]), there
 
 
@@ -138,15 +138,15 @@ def normal_of(segment: Float[Array, "2 2"]) -> Float[Array, "2"]:
 def invent(
     camera: Camera, detection: Detection, key: PRNGKeyArray
 ) -> tuple[Float[Array, "false 2 2"], Bool[Array, "false"]]:
-    """Segments of nothing, anywhere in the picture and in any direction."""
+    """False segments, anywhere in the picture and in any direction."""
     count_key, place_key, angle_key, length_key = jax.random.split(key, 4)
     there = jax.random.uniform(count_key, (FALSE_SLOTS,)) < detection.false_segments / FALSE_SLOTS
     size = jnp.array([camera.width - 1, camera.height - 1], float)
     middle = jax.random.uniform(place_key, (FALSE_SLOTS, 2)) * size[None]
     angle = jax.random.uniform(angle_key, (FALSE_SLOTS,)) * jnp.pi
     half = detection.shortest / 2 + 10 * jax.random.exponential(length_key, (FALSE_SLOTS,))
-    reach = half[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    ends = jnp.stack([middle - reach, middle + reach], axis=1)
+    offset = half[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    ends = jnp.stack([middle - offset, middle + offset], axis=1)
     return jnp.clip(ends, 0, size[None, None]), there
 
 
