@@ -190,7 +190,7 @@ def outside(odometry: Trajectory, stamps: np.ndarray) -> np.ndarray:
 
 
 def read_odometry(path: Path) -> TrajectoryFile:
-    """The odometry as it stands in its file, of two poses or more; `mend` makes it a path."""
+    """The odometry as its file has it, of two poses or more; `mend` makes it a path."""
     if not path.exists():
         raise InputError(
             f"{path}: the wheel odometry is missing, and without it neither the motion nor the "
@@ -203,7 +203,7 @@ def read_odometry(path: Path) -> TrajectoryFile:
 
 
 def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
-    """Stamps in seconds, files, whether the stamps are nanoseconds in the list, and remarks."""
+    """Stamps in seconds, files, whether the list has nanoseconds, and remarks."""
     table, at_line = path / "rgb.txt", f"{path / 'rgb.txt'}, line "
     numbers, stamps, names = [], [], []
     for number, line in rows(table, "the list of images"):
@@ -236,7 +236,7 @@ def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
 
 
 class _Folder:
-    """What lies in a drive's folder, each folder looked at once; links must not lead out of it."""
+    """The files of a drive's folder; each folder is listed once, and links must not lead out."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -44,12 +44,12 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class TrajectoryFile:
-    """A trajectory, and how it stands in its file."""
+    """A trajectory, and how its file has it."""
 
     trajectory: Trajectory
     lines: np.ndarray  # [n] the line of each pose
-    nanoseconds: bool  # what its timestamps are in the file
-    remarks: list[str]  # sentences on what was read otherwise than it stands there
+    nanoseconds: bool  # whether the file's timestamps are nanoseconds, not seconds
+    remarks: list[str]  # sentences on what was read differently from how it is written
 
 
 def read_trajectory(path: Path, what: str = "a trajectory") -> Trajectory:
@@ -198,7 +198,7 @@ class TrajectoryWriter:
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            with contextlib.suppress(OSError):  # what is no regular file cannot be cut
+            with contextlib.suppress(OSError):  # only a regular file can be truncated
                 self._file.truncate(self._size)  # a part of the row may have been written
             error.filename = str(self._path)
             raise

@@ -28,7 +28,7 @@ from sofjax.simulation.segments.detection import (
 from sofjax.simulation.segments.visibility import in_picture, length_in_image, project, unhidden
 from sofjax.simulation.world.types import NARROW, World
 
-CANDIDATES = 96  # edges of an image, the longest, whose hiding is worked out
+CANDIDATES = 96  # the longest edges of an image, for which occlusion is computed
 
 
 class Scene(eqx.Module):
@@ -129,7 +129,7 @@ def see(
     part = jax.vmap(unhidden, in_axes=(0, 0, None))(plan, part, scene.walls_world - C[None, None])
     segments = jax.vmap(project)(homogeneous, part)
 
-    # As a detector reports them, each of the two edges of a fine line by a draw of its own
+    # As a detector reports them, with a separate draw for each of the two edges of a fine line
     miss_key, break_key, false_key, noise_key = jax.random.split(key, 4)
     seldom = jax.random.uniform(miss_key, (candidates, 2)) / (1 - detection.missed)
     wanted = detection.min_contrast + seldom * (detection.full_contrast - detection.min_contrast)

@@ -1,4 +1,4 @@
-"""The patterns of a corridor's floor, drawn by chance."""
+"""The patterns of a corridor's floor, at random."""
 
 from dataclasses import dataclass, field
 
@@ -71,7 +71,7 @@ def contrasting(
 
 @dataclass(frozen=True)
 class Plan:
-    """The bare corridor that is being fitted out."""
+    """The bare corridor that is furnished."""
 
     corridors: Float[np.ndarray, "n 4"]
     walls: Float[np.ndarray, "walls 2 2"]
