@@ -121,7 +121,7 @@ def calibrate_drive(
             fitted, covariance = _jointly(camera, found, log, free)
         residuals = np.asarray(found.fit.residuals)[np.asarray(found.pairs.valid)]
     doubt = "; ".join([
-        *filter(None, [doubts(found.fit)]),
+        *filter(None, [doubts(found.fit, config.fit)]),
         *fitted_height(float(fitted.height), float(mount.height)),
     ])  # fmt: skip
     evidence = f"{len(residuals)} of {found.related} pairs of segments taken for floor"

@@ -22,7 +22,7 @@ FALSE_SLOTS = 8  # false segments of an image at most
 class Detection(eqx.Module):
     """How a line detector errs; the defaults are those of LSD on 320×240 pixels.
 
-    `blur` and the contrasts were measured on drawn images of fine lines. `experiments/ablation`
+    `blur` and the contrasts were measured on drawn images of fine lines. The ablation study
     compares the filter's errors on such segments with those on images of the same drives.
     """
 
