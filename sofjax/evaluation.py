@@ -19,8 +19,8 @@ SAMPLES = 500_000  # ... of 10 km at most, and further apart in a longer one
 PAIRS = 5_000_000_000  # of samples and segments that are compared at most, likewise
 NEAR = 0.05  # metres from a true line within which a sample is right ...
 PARALLEL = np.deg2rad(5)  # ... if its direction is this near too
-TOGETHER = 256  # samples of about one place ...
-PLACE = 1.0  # ... of so many metres, compared at once
+TOGETHER = 256  # samples that are compared at once ...
+PLACE = 1.0  # ... as they lie within so many metres
 IN_SIGHT = 3.0  # metres from the path within which a true line counts as seen
 
 
@@ -66,7 +66,7 @@ class MapErrors:
 
 
 def align(points: np.ndarray, onto: np.ndarray) -> RigidMotion:
-    """The rigid motion that takes `points` [n, 2] nearest to `onto` [n, 2] in least squares."""
+    """The rigid motion that moves `points` [n, 2] onto `onto` [n, 2], by least squares."""
     middle, onto_middle = points.mean(0), onto.mean(0)
     U, _, Vt = np.linalg.svd((onto - onto_middle).T @ (points - middle))
     R = U @ np.diag([1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
@@ -74,8 +74,10 @@ def align(points: np.ndarray, onto: np.ndarray) -> RigidMotion:
 
 
 def shared(truth: Trajectory, estimate: Trajectory) -> Trajectory:
-    """The true poses in the time that the estimate spans, those in its gaps left out: an estimate
-    that is interpolated over a gap is nobody's."""
+    """The true poses in the time that the estimate spans, without those in its gaps.
+
+    In a gap an interpolated pose is no estimate.
+    """
     begin, end = estimate.stamps[0] - SLACK, estimate.stamps[-1] + SLACK
     span = (truth.stamps >= begin) & (truth.stamps <= end)
     usual = float(np.median(np.diff(estimate.stamps))) if len(estimate.stamps) > 1 else 0.0
@@ -139,7 +141,7 @@ def _drift_percent(
 def evaluate_map(
     truth: np.ndarray, segments: np.ndarray, motion: RigidMotion, path: np.ndarray
 ) -> MapErrors:
-    """Compare the length of a map with that of the truth, both ways.
+    """Precision and recall of a map by length, against the true segments.
 
     **Arguments:**
     - `truth`: [S, 2, 2], true segments, world frame, metres.
@@ -166,8 +168,8 @@ def evaluate_map(
 
 def _spacing(segments: np.ndarray, others: np.ndarray) -> float:
     """Metres between the samples of the segments: 2 cm, unless they would be too many."""
-    most = min(SAMPLES, PAIRS // max(1, len(others)))
-    return max(SPACING, float(np.hypot(*(segments[:, 1] - segments[:, 0]).T).sum()) / most)
+    max_samples = min(SAMPLES, PAIRS // max(1, len(others)))
+    return max(SPACING, float(np.hypot(*(segments[:, 1] - segments[:, 0]).T).sum()) / max_samples)
 
 
 def sample(segments: np.ndarray, spacing: float = SPACING) -> tuple[np.ndarray, np.ndarray]:

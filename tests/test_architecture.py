@@ -1,4 +1,4 @@
-"""The direction of imports, and where files, printing, cv2 and matplotlib are known."""
+"""The direction of imports, what each room may know, and the sizes of files and functions."""
 
 import ast
 import subprocess
@@ -68,7 +68,8 @@ def test_imports_point_one_way(file):
 
 def test_the_ground_knows_jax_and_equinox_alone():
     for file in in_room("geometry"):
-        assert {module.split(".")[0] for module in imports(file)} <= MATHS - {"numpy", "optimistix"}
+        modules = {module.split(".")[0] for module in imports(file)} - sys.stdlib_module_names
+        assert modules <= MATHS - {"numpy", "optimistix"}, file
 
 
 def test_the_core_knows_no_more_than_mathematics():
@@ -104,6 +105,58 @@ def test_experiments_use_what_the_rooms_offer(file):
     for module in imports(file):
         top, *inner = module.split(".")
         assert top != "sofjax" or len(inner) <= 1 + (inner[:1] == ["io"]), module
+
+
+def functions(file):
+    """Every function of a file, nested ones and methods too, and its arguments but `self`."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            given = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+            yield node, [a for a in given if a.arg not in ("self", "cls")]
+
+
+def test_no_function_is_longer_than_a_screen_or_takes_many_arguments():
+    long, many = [], []
+    for file in FILES:
+        for node, arguments in functions(file):
+            doc = ast.get_docstring(node, clean=False) or ""
+            lines = node.end_lineno - node.lineno + 1 - len(doc.splitlines())
+            long += [f"{file.name}:{node.name} {lines}"] * (lines > 60)
+            many += [f"{file.name}:{node.name} {len(arguments)}"] * (len(arguments) > 8)
+    assert not long and not many
+
+
+def test_no_file_is_long():
+    tests = sorted(Path(__file__).parent.glob("*.py"))
+    limits = dict.fromkeys(FILES, 300) | dict.fromkeys(tests, 350)
+    lines = {file: len(file.read_text().splitlines()) for file in limits}
+    assert not [f"{file.name} {lines[file]}" for file in limits if lines[file] > limits[file]]
+
+
+def test_functions_are_annotated():
+    found = [each for file in FILES for each in functions(file)]
+    bare = [
+        node.name
+        for node, arguments in found
+        if node.returns is None or any(a.annotation is None for a in arguments)
+    ]
+    assert len(bare) <= 0.03 * len(found), bare
+
+
+def test_no_imports_run_in_a_circle():
+    """Those inside functions count too."""
+    path = lambda file: file.relative_to(PACKAGE.parent).with_suffix("").parts
+    modules = {".".join(path(file)).removesuffix(".__init__"): file for file in FILES}
+    left = {name: set() for name in modules}
+    for name, file in modules.items():
+        for node in ast.walk(ast.parse(file.read_text())):
+            for alias in node.names if isinstance(node, ast.ImportFrom) else ():
+                inner = f"{node.module}.{alias.name}"
+                left[name].add(inner if inner in modules else node.module)
+    while ends := [name for name in left if not left[name] & left.keys()]:
+        for name in ends:
+            del left[name]
+    assert not left, "each of these imports another of them"
 
 
 def modules_after(code):

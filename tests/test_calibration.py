@@ -1,123 +1,35 @@
 """The mount from pairs of segments: recovered, with honest errors, refused if unobservable."""
 
-import dataclasses
-import re
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from conftest import jit_quickly, make_camera
+from conftest import jit_quickly
+from line_pairs import FIT, N, fit_mount, make_pairs, off, true_mount, value, weighed
 
 from sofjax.calibration import (
     TURNS,
     UNKNOWNS,
     FitConfig,
-    PairNoise,
-    SegmentPairs,
     distances,
-    expected,
 )
 from sofjax.calibration import fit_mount as compiled_well
-from sofjax.calibration.assessment import FitOutcome, ambiguity, assess, doubts
-from sofjax.calibration.fit_drive import DriveFitConfig
-from sofjax.calibration.floor_test import FloorTestConfig, lies_on_floor
 from sofjax.calibration.pairs import Estimate, start_at
-from sofjax.calibration.tracks import TrackConfig, follow, relate
-from sofjax.extraction.observation import Observation
-from sofjax.geometry import SE2, Mount, Segments, projection_matrix
-from sofjax.motion import without_unread_motions
+from sofjax.geometry import SE2, projection_matrix
 
 pytestmark = pytest.mark.usefixtures("x64")
-
-N = 96
-MOUNT = (0.05, 0.0, 0.6, 0.26, 0.02, 0.0)  # x, y, height, pitch, roll, yaw
-
-
-@jit_quickly
-def fit_mount(camera, mount, pairs, config=None):
-    return compiled_well(camera, mount, pairs, config or FitConfig())
-
-
-FIT = {"height": 0.6, "pitch": 0.26, "roll": 0.02}
-
-
-@pytest.fixture
-def camera():
-    return make_camera()
 
 
 @pytest.fixture
 def mount():
-    return Mount(*map(jnp.asarray, MOUNT))
-
-
-def off(mount, times=1.0, pitch=0.0, roll=0.0):
-    return eqx.tree_at(
-        lambda m: (m.height, m.pitch, m.roll),
-        mount,
-        (mount.height * times, mount.pitch + pitch, mount.roll + roll),
-    )
-
-
-def seen(camera, mount, pose, points):
-    """World points [N, 2, 3] in an image, pixels, by the plain projection."""
-    P = np.asarray(
-        projection_matrix(camera, mount, SE2(jnp.asarray(pose[:2]), jnp.asarray(pose[2])))
-    )
-    x = np.concatenate([points, np.ones((*points.shape[:2], 1))], axis=-1) @ P.T
-    assert (x[..., 2] > 0).all()
-    return x[..., :2] / x[..., 2:]
-
-
-def make_pairs(camera, mount, rng, motion=None, angle=None, noise=0.0, z=0.0):
-    """N lines of the floor, each seen before and after a motion of its own."""
-    first = np.stack(
-        [rng.uniform(-0.2, 0.2, N), rng.uniform(-0.1, 0.1, N), rng.uniform(-1, 1, N)], 1
-    )
-    if motion is None:
-        motion = np.stack(
-            [rng.uniform(0.3, 0.9, N), rng.normal(0, 0.02, N), rng.normal(0, 0.05, N)], axis=1
-        )
-    T1 = SE2(jnp.asarray(first[:, :2]), jnp.asarray(first[:, 2]))
-    T12 = SE2(jnp.asarray(motion[:, :2]), jnp.asarray(motion[:, 2]))
-    T2 = T1 @ T12
-    middle = np.stack([rng.uniform(1.7, 4, N), rng.uniform(-0.8, 0.8, N)], axis=1)
-    angle = rng.uniform(0, np.pi, N) if angle is None else angle
-    along = rng.uniform(0.15, 0.4, N)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    ends = np.asarray(T1.apply(jnp.asarray(np.stack([middle - along, middle + along])))).swapaxes(
-        0, 1
-    )
-    height = np.broadcast_to(z, N)[:, None, None] * np.ones((N, 2, 1))
-    points = np.concatenate([ends, height], axis=-1)
-    images = []
-    for T in (T1, T2):
-        poses = np.concatenate([np.asarray(T.xy), np.asarray(T.yaw)[:, None]], axis=1)
-        images.append(np.concatenate([
-            seen(camera, mount, pose, point[None])
-            for pose, point in zip(poses, points, strict=True)
-        ]))  # fmt: skip
-    images = [image + rng.normal(0, noise, image.shape) for image in images]
-    return SegmentPairs(
-        *map(jnp.asarray, images), T12, jnp.ones(N, bool), jnp.ones((N, 4)), jnp.arange(N)
-    )
-
-
-def weighed(camera, mount, pairs, **noise):
-    return eqx.tree_at(
-        lambda p: p.sigma, pairs, expected(PairNoise(**noise), camera, start_at(mount), pairs)
-    )
+    return true_mount()
 
 
 @pytest.fixture
 def pairs(camera, mount, rng):
     return make_pairs(camera, mount, rng)
-
-
-def value(result):
-    return np.array([result.mount.height, result.mount.pitch, result.mount.roll])
 
 
 def test_distances_are_those_of_the_ends_from_the_other_s_line(camera, mount, pairs):
@@ -188,27 +100,6 @@ def test_yaw_and_the_odometer_s_turns_can_be_free_too(camera, mount, rng):
     np.testing.assert_allclose(value(found), list(FIT.values()), atol=1e-3)
     assert float(found.mount.yaw) == pytest.approx(0.06, abs=1e-3)
     np.testing.assert_allclose(found.odometer, bias, atol=1e-3)
-
-
-def test_an_odometer_put_far_off_its_prior_widens_all_error_bars(camera, mount, rng):
-    """The same drive, read right and read 30 % short in left turns, is known less by the ratio."""
-    motion = np.stack(
-        [rng.uniform(0.3, 0.9, N), rng.normal(0, 0.02, N), rng.uniform(0.1, 0.3, N)], axis=1
-    )
-    pairs = weighed(camera, mount, make_pairs(camera, mount, rng, motion, noise=0.3))
-    short = eqx.tree_at(
-        lambda p: p.T_first_second,
-        pairs,
-        jax.vmap(Estimate(mount, jnp.array([0.0, -0.3, 0.0, 0.0])).motion)(pairs.T_first_second),
-    )
-    config = FitConfig(free=("height", "pitch", "roll", "left"))
-    right, wrong = (fit_mount(camera, mount, p, config) for p in (pairs, short))
-    assert float(right.birge_ratio) == 1 and doubts(right) == ""
-    sigmas = float(wrong.odometer[1]) / config.prior_sigma[5]
-    assert float(wrong.birge_ratio) == pytest.approx(abs(sigmas)) and sigmas > 5
-    assert "clock or odometer" in doubts(wrong)
-    ratio = np.sqrt(np.diag(wrong.covariance)[:3] / np.diag(right.covariance)[:3])
-    np.testing.assert_allclose(ratio, sigmas, rtol=0.3)
 
 
 def test_outliers_hardly_matter(camera, mount, rng):
@@ -301,153 +192,7 @@ def cramer_rao(camera, mount, pairs, sigma):
     return np.sqrt(np.diag(np.linalg.inv(information))) * [float(mount.height), 1, 1]
 
 
-def refusal(camera, mount, pairs):
-    config = FitConfig()
-    found = fit_mount(camera, mount, weighed(camera, mount, pairs), config)
-    assessment = assess(found, config, pairs)
-    assert not assessment.usable
-    assert np.isfinite(found.covariance).all()
-    return found, assessment
-
-
-def test_a_pure_rotation_has_no_height(camera, mount, rng):
-    centred = eqx.tree_at(lambda m: m.x, mount, jnp.zeros(()))
-    motion = np.stack([np.zeros(N), np.zeros(N), rng.uniform(-0.25, 0.25, N)], axis=1)
-    pairs = make_pairs(camera, centred, rng, motion, noise=0.3)
-    found, refused = refusal(camera, centred, pairs)
-    assert not bool(found.observable[0]) and int(np.abs(found.weakest).argmax()) == 0
-    assert refused.outcome is FitOutcome.NOT_OBSERVABLE and "height" in refused.sentence
-
-
-def test_lines_along_the_motion_have_no_height(camera, mount, rng):
-    motion = np.stack([rng.uniform(0.3, 0.9, N), np.zeros(N), np.zeros(N)], axis=1)
-    pairs = make_pairs(camera, mount, rng, motion, angle=np.zeros(N), noise=0.3)
-    found, refused = refusal(camera, mount, pairs)
-    assert not bool(found.observable[0]) and "height" in refused.sentence
-
-
-def test_few_pairs_are_none(camera, mount, pairs):
-    few = eqx.tree_at(lambda p: p.valid, pairs, jnp.arange(N) < 12)
-    found, refused = refusal(camera, mount, few)
-    assert refused.outcome is FitOutcome.TOO_FEW_PAIRS
-    assert not found.observable.any() and "12 pairs" in refused.sentence
-    found, refused = refusal(
-        camera, mount, eqx.tree_at(lambda p: p.valid, pairs, jnp.zeros(N, bool))
-    )
-    assert "0 pairs" in refused.sentence and np.isfinite(value(found)).all()
-
-
-def test_what_stands_above_the_floor_is_told_by_its_height(camera, mount, rng):
-    z = np.where(np.arange(N) // 6 % 3 == 0, 0.1, 0.0)  # six pairs of each line
-    pairs = weighed(camera, mount, make_pairs(camera, mount, rng, noise=0.3, z=z))
-    line = jnp.arange(N) // 6
-    floor = np.asarray(lies_on_floor(FloorTestConfig(), camera, start_at(mount), pairs, line))
-    assert floor[z == 0].mean() > 0.9 and floor[z > 0].mean() < 0.3
-    wild = eqx.tree_at(
-        lambda p: p.second, pairs, pairs.second + jnp.asarray(rng.normal(0, 15, (N, 2, 2)))
-    )
-    assert not np.asarray(
-        lies_on_floor(FloorTestConfig(), camera, start_at(mount), wild, line)
-    ).any()
-
-
-@pytest.fixture
-def log(camera, mount, rng):
-    """Forty images on a straight path over twelve lines, slightly noisy; one is missed once."""
-    ends = np.zeros((12, 2, 3))
-    angle = np.linspace(0.3, 2.8, 12)
-    along = 0.3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    middle = np.stack([np.linspace(3, 5, 12), np.linspace(-0.7, 0.7, 12)], axis=1)
-    ends[..., :2] = np.stack([middle - along, middle + along], axis=1)
-    images = [seen(camera, mount, (0.05 * i, 0.0, 0.0), ends) for i in range(40)]
-    endpoints = np.zeros((40, 16, 2, 2))
-    order = np.stack([rng.permutation(12) for _ in range(40)])
-    endpoints[:, :12] = np.stack([image[p] for image, p in zip(images, order, strict=True)])
-    endpoints[:, :12] += rng.normal(0, 0.2, (40, 12, 2, 2))
-    valid = np.broadcast_to(np.arange(16) < 12, (40, 16)).copy()
-    valid[20, np.flatnonzero(order[20] == 5)] = False
-    motion = SE2(jnp.tile(jnp.array([[0.05, 0.0]]), (40, 1)).at[0].set(0), jnp.zeros(40))
-    log = Observation(
-        Segments(jnp.asarray(endpoints), jnp.asarray(valid)), motion, jnp.zeros(40, int)
-    )
-    return log, order
-
-
-def test_lines_are_followed_though_missed_once_and_the_mount_is_rough(camera, mount, log):
-    log, order = log
-    track = follow(TrackConfig(), camera, start_at(off(mount, 1.25, 0.1)), log)
-    assert (track[:, 12:] == -1).all() and (track[20] == -1).sum() == 5
-    of_line = np.where(track[:, :12] >= 0, track[:, :12], 0)
-    for t in range(1, 40):
-        for m in range(12):
-            before = int(np.flatnonzero(order[t - 1] == order[t, m])[0])
-            if track[t, m] >= 0 and track[t - 1, before] >= 0:
-                assert of_line[t, m] == of_line[t - 1, before]
-    gap = [track[t, np.flatnonzero(order[t] == 5)[0]] for t in (19, 21)]
-    assert gap[0] == gap[1] >= 0
-
-
-def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
-    log, _ = log
-    config = TrackConfig()
-    unread = dataclasses.replace(log, motion_sigma=jnp.zeros((40, 3)).at[20].set(0.1))
-    track = follow(config, camera, start_at(mount), unread)
-    before, behind = (np.unique(part[part >= 0]) for part in (track[:20], track[20:]))
-    assert len(before) == 12 and not np.intersect1d(before, behind).size
-    known = without_unread_motions(log)
-    assert known is log
-    xy = log.motion.xy.at[20, 0].set(jnp.nan)
-    nan = dataclasses.replace(log, motion=SE2(xy, log.motion.yaw))
-    known = without_unread_motions(nan)
-    assert (np.flatnonzero(np.asarray(known.motion_sigma).any(axis=1)) == [20]).all()
-    assert np.isfinite(known.motion.xy).all()
-    np.testing.assert_array_equal(known.motion.xy[:20], log.motion.xy[:20])
-
-
-def test_pairs_are_nested_and_use_each_segment_once(camera, mount, log):
-    log, _ = log
-    track = follow(TrackConfig(), camera, start_at(mount), log)
-    pairs, line = relate(TrackConfig(), log, track, 0.6, 256)
-    valid = np.asarray(pairs.valid)
-    assert valid.sum() > 60 and len(np.unique(np.asarray(line)[valid])) == 12
-    path = np.asarray(pairs.T_first_second.xy)[valid, 0]
-    assert path.min() >= 0.3 - 1e-9 and path.max() <= 1.2 + 1e-9
-    used = np.concatenate([np.asarray(pairs.first)[valid], np.asarray(pairs.second)[valid]])
-    assert len(np.unique(used.reshape(-1, 4), axis=0)) == len(used)
-    assert (np.asarray(line)[~valid] == -1).all()
-    few, _ = relate(TrackConfig(), log, track, 0.6, 32)
-    assert np.asarray(few.valid).all() and len(few.valid) == 32
-    found = fit_mount(camera, off(mount, 1.2, 0.08), pairs)
-    np.testing.assert_allclose(value(found), list(FIT.values()), atol=0.01)
-
-
 def test_unknowns_are_in_the_order_of_the_covariance(camera, mount, pairs):
     found = fit_mount(camera, mount, pairs, FitConfig(free=("pitch",)))
     assert UNKNOWNS[1] == "pitch"
     assert np.flatnonzero(np.diag(np.asarray(found.covariance)) > 0).tolist() == [1]
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: FitConfig(free=("pitch", "heigth")), "FitConfig.free must be some of height"),
-        (lambda: FitConfig(min_pairs=0), "FitConfig.min_pairs must be a whole number from 1"),
-        (lambda: FitConfig(limit=(0.05, 0.02)), "FitConfig.limit must be 8 numbers above 0"),
-        (lambda: FitConfig(prior_sigma=(-1.0,) * 8), "FitConfig.prior_sigma must be 8 numbers"),
-        (lambda: FloorTestConfig(max_rms=0.0), "FloorTestConfig.max_rms must be a number above 0"),
-        (lambda: TrackConfig(max_lag=0), "TrackConfig.max_lag must be a whole number from 1"),
-        (lambda: PairNoise(pixel_sigma=-0.5), "PairNoise.pixel_sigma must be a number from 0"),
-        (lambda: DriveFitConfig(starts=()), "DriveFitConfig.starts must be one or more pairs"),
-        (lambda: DriveFitConfig(capacity=0), "DriveFitConfig.capacity must be a whole number"),
-    ],
-)
-def test_bad_settings_are_refused_by_name(make, words):
-    with pytest.raises(ValueError, match=re.escape(words)):
-        make()
-
-
-def test_starts_that_end_in_different_places_are_ambiguous():
-    found = ambiguity(np.array([[0.6, 0.26, 0.02], [0.7, 0.26, 0.03]]))
-    assert found.outcome is FitOutcome.AMBIGUOUS and not found.usable
-    assert "from 2 starts" in found.sentence and "heights 0.600 to 0.700 m" in found.sentence
-    assert "pitch" not in found.sentence and "roll 1.1 to 1.7°" in found.sentence

@@ -6,7 +6,7 @@ import pytest
 from sofjax.io.contradictions import contradictions
 from sofjax.io.odometry import (
     FASTER,
-    LEAST,
+    MIN_SIGMA,
     Outage,
     Speeds,
     extended,
@@ -177,7 +177,7 @@ def test_what_is_not_known_of_a_motion_is_half_the_usual_speed():
     assert over is None  # from before the hole to behind it the poses tell all
     jump = unknown_motion([Outage(1.02, 1.06, False, "")], speeds, stamps)
     assert np.flatnonzero(jump.any(axis=1)).tolist() == [11]
-    np.testing.assert_allclose(jump[11, 0], np.hypot(0.4 * 0.04, LEAST), rtol=1e-6)
+    np.testing.assert_allclose(jump[11, 0], np.hypot(0.4 * 0.04, MIN_SIGMA), rtol=1e-6)
     assert unknown_motion([Outage(9.0, 9.5, False, "")], speeds, stamps) is None
 
 

@@ -17,8 +17,8 @@ from sofjax.io.camera_file import CameraFile, horizon_image
 from sofjax.vision import (
     Frontend,
     FrontendSettings,
+    ImageSegments,
     Lens,
-    View,
     detect_hough,
     detect_lsd,
     pack,
@@ -232,7 +232,7 @@ def test_a_small_file_that_unfolds_into_gigabytes_is_no_image(tmp_path):
 
 def view_of(*segments, fault=""):
     packed, overflow = pack(np.reshape(segments, (-1, 4)).astype(np.float32), 4)
-    return View(packed, overflow, len(segments), fault, {})
+    return ImageSegments(packed, overflow, len(segments), fault, {})
 
 
 def test_a_view_that_repeats_the_last_one_while_the_robot_moves_tells_nothing():

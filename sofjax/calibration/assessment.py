@@ -8,11 +8,9 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Float
 
-from sofjax.calibration.fit import CalibrationResult, FitConfig
+from sofjax.calibration.fit import DEFAULT, CalibrationResult, FitConfig
 from sofjax.calibration.pairs import TURNS, UNKNOWNS, SegmentPairs
 from sofjax.geometry.camera import Mount
-
-BIRGE_LIMIT = 2.0  # three odometer errors give a ratio above it by chance in 1 of 140 drives
 
 SCALE = (
     "only the height over the odometer's distances can be seen: an odometer that reads 1 % too "
@@ -85,7 +83,7 @@ def assess(found: CalibrationResult, config: FitConfig, pairs: SegmentPairs) -> 
         return Assessment.of(
             FitOutcome.NOT_OBSERVABLE,
             unknowns=" and ".join(wide),
-            reason=doubts(found) or _HINT,
+            reason=doubts(found, config) or _HINT,
         )
     if found.result != optx.RESULTS.successful:
         return Assessment.of(FitOutcome.NOT_CONVERGED)
@@ -105,10 +103,10 @@ def ambiguity(ends: Float[np.ndarray, "starts 3"]) -> Assessment:
     return Assessment.of(FitOutcome.AMBIGUOUS, starts=len(ends), places=", ".join(places))
 
 
-def doubts(found: CalibrationResult) -> str:
+def doubts(found: CalibrationResult, config: FitConfig = DEFAULT) -> str:
     """What speaks against a fit that converged, in words; empty if nothing."""
     birge_ratio = float(found.birge_ratio)
-    if birge_ratio < BIRGE_LIMIT:
+    if birge_ratio < config.max_birge_ratio:
         return ""
     return (
         f"the fit needs an odometer whose errors are {birge_ratio:.1f} times those of usual "

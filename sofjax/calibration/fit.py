@@ -35,9 +35,15 @@ class FitConfig(eqx.Module):
     limit: tuple[float, ...] = (0.05, 0.02, 0.02, 0.02, 0.05, 0.1, 0.1, 0.01)
     pixel_sigma: float = 0.5  # pixels: jitter whose information does not count, see `_sandwich`
     min_pairs: int = 20
+    # a larger Birge ratio is a doubt; three odometer errors exceed it by chance in 1 of 140 drives
+    max_birge_ratio: float = 2.0
 
     def __check_init__(self) -> None:
-        check_fields(self, positive=("loss_scale", "pixel_sigma"), whole_from={"min_pairs": 1})
+        check_fields(
+            self,
+            positive=("loss_scale", "pixel_sigma", "max_birge_ratio"),
+            whole_from={"min_pairs": 1},
+        )
         for name in self.free:
             if name not in UNKNOWNS:
                 raise ValueError(

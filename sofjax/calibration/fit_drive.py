@@ -19,8 +19,6 @@ from sofjax.motion import MotionModel, without_unread_motions
 
 # where to begin: at the mount given, and far from it
 STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
-SEARCH, REFINE = 10, 3  # most rounds from each start, and rounds from where most of them end
-SETTLED = 0.1  # a search ends with a round that moves by less, in units of `_distance`
 
 
 def random_only() -> PairNoise:
@@ -39,13 +37,20 @@ class DriveFitConfig:
         default_factory=lambda: FitConfig(free=("height", "pitch", "roll", *TURNS))
     )
     starts: tuple[tuple[float, float], ...] = STARTS  # factor of height, radians added to pitch
+    search_rounds: int = 10  # from each start, at most
+    settled: float = 0.1  # a search ends with a round that moves by less, in units of `_distance`
+    refine_rounds: int = 3  # from where most starts end, with the test of the floor
     capacity: int = 4096  # pairs
     # two starts that end within these limits end in the same place
     same_height: float = 0.03  # share of the height
     same_angle: float = 0.01  # radians, of pitch and roll
 
     def __post_init__(self) -> None:
-        check_fields(self, whole_from={"capacity": 1}, positive=("same_height", "same_angle"))
+        check_fields(
+            self,
+            whole_from={"capacity": 1, "search_rounds": 1, "refine_rounds": 1},
+            positive=("settled", "same_height", "same_angle"),
+        )
         if not self.starts or not all(0 < factor < np.inf for factor, _ in self.starts):
             raise ValueError(
                 "DriveFitConfig.starts must be one or more pairs (factor above 0, radians), "
@@ -103,7 +108,7 @@ def fit_drive(
     agreeing = (_distance(ends[:, None], ends, config) < 1).all(-1).sum(1)
     best = int(np.lexsort((-np.array([f.pairs.valid.sum() for f in searched]), -agreeing))[0])
     found = searched[best]
-    for _ in range(REFINE):
+    for _ in range(config.refine_rounds):
         found = _round(camera, found.estimate, log, config, test_floor=True)
     return DriveFit(found.fit, found.pairs, found.line, found.related, ends, int(agreeing[best]))
 
@@ -132,10 +137,10 @@ def _distance(
 def _search(camera: Camera, mount: Mount, log: Observation, config: DriveFitConfig) -> DriveFit:
     """The last of the rounds from one start, which hardly moves the mount."""
     found = _round(camera, start_at(mount), log, config, test_floor=False)
-    for _ in range(SEARCH - 1):
+    for _ in range(config.search_rounds - 1):
         before = _place(found.fit.mount)
         found = _round(camera, found.estimate, log, config, test_floor=False)
-        if (_distance(before, _place(found.fit.mount), config) < SETTLED).all():
+        if (_distance(before, _place(found.fit.mount), config) < config.settled).all():
             break
     return found
 

@@ -1,4 +1,4 @@
-"""The ground: frames, cameras, the floor and its lines. Pure functions of jax and equinox alone."""
+"""Frames, cameras, the floor and its lines. Pure functions; only JAX and Equinox are imported."""
 
 from sofjax.geometry.camera import Camera as Camera
 from sofjax.geometry.camera import Mount as Mount

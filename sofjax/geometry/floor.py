@@ -58,7 +58,7 @@ def may_be_upright(
     """Whether a segment's ends are within `gate` pixels of a line through its middle and the nadir.
 
     The image of the nadir (homogeneous) is where the images of all uprights meet: an edge of a door
-    or a box always points there, and for a short way moves like a line of the floor.
+    or a box always points there, and over a short motion it moves like a line of the floor.
     """
     line = jnp.cross(nadir_image, jnp.append(segment_image.mean(axis=0), 1))
     return jnp.abs(line_point_distance(line, segment_image[0])) < gate
@@ -67,7 +67,7 @@ def may_be_upright(
 def segment_to_floor(
     H_F: Float[Array, "3 3"], segment_image: Float[Array, "2 2"], max_depth: Float[Array, ""]
 ) -> tuple[Float[Array, "2 2"], Bool[Array, ""]]:
-    """A segment put on the floor by one inverse projection; eqs. (12) and (13).
+    """A segment projected to the floor by one inverse projection; eqs. (12) and (13).
 
     1 / depth is affine in the image: the part above the horizon or farther than `max_depth`
     metres is clipped away, exactly, before anything is divided.

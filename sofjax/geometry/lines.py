@@ -54,7 +54,7 @@ def polar_through(endpoints: Float[Array, "2 2"]) -> PolarLine:
 
 
 def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "*batch 2"]:
-    """(rho_a - rho_b, theta_a - theta_b) of two lines, whichever way each is directed.
+    """(rho_a - rho_b, theta_a - theta_b) of two lines, whatever the direction of each.
 
     Differs from the paper: eq. (9) subtracts the numbers as they stand, which jump by the
     sign of rho where a line is named from its other side. Here the normal of `b` is turned to
@@ -66,7 +66,7 @@ def polar_difference(a: PolarLine, b: PolarLine) -> Float[Array, "*batch 2"]:
 def polar_differences(
     a: PolarLine, b: PolarLine
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """`polar_difference` as two arrays, which compute in one loop where a pair is many."""
+    """`polar_difference` as two arrays, which XLA computes in one loop over many pairs."""
     turn = a.theta - b.theta
     half_turns = jnp.round(turn / jnp.pi)
     return a.rho - _side(half_turns) * b.rho, turn - jnp.pi * half_turns
@@ -78,7 +78,7 @@ def alignment(a: PolarLine, b: PolarLine) -> Float[Array, "*batch"]:
 
 
 def _side(half_turns: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """1 for even, -1 for odd; `jnp.remainder` would be called number by number."""
+    """1 for even, -1 for odd; `jnp.remainder` is not vectorised by XLA."""
     return 1 - 2 * (half_turns - 2 * jnp.floor(half_turns / 2))
 
 

@@ -1,4 +1,4 @@
-"""Small matrices in great number."""
+"""Many small matrices at once."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

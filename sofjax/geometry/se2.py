@@ -22,7 +22,7 @@ class SE2(eqx.Module):
 
     def rotate(self, vectors: Float[Array, "*points 2"]) -> Float[Array, "... 2"]:
         """Turn vectors, whose axes in front broadcast against the batch's."""
-        # no stack of sums, for whose every number XLA would work cosine and sine out anew
+        # a stack of sums would make XLA recompute cosine and sine for each number
         c, s = jnp.cos(self.yaw)[..., None], jnp.sin(self.yaw)[..., None]
         return c * vectors + s * _quarter_turn(vectors)
 

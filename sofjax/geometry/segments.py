@@ -51,7 +51,7 @@ def overlap(
     d = unit(second)
     along = lambda x: x[..., 0] * d[..., 0] + x[..., 1] * d[..., 1]
     a0, a1, b0, b1 = (along(ends[..., i, :]) for ends in (first, second) for i in (0, 1))
-    lesser = lambda a, b: jnp.where(a < b, a, b)  # `minimum` looks for NaN besides, in every pair
+    lesser = lambda a, b: jnp.where(a < b, a, b)  # `minimum` also looks for NaN, in every pair
     greater = lambda a, b: jnp.where(a < b, b, a)
     low = greater(lesser(a0, a1), lesser(b0, b1))
     return lesser(greater(a0, a1), greater(b0, b1)) - low

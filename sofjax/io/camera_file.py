@@ -18,11 +18,11 @@ Number = TypeVar("Number", bound=SupportsFloat)
 
 ANGLES = ("pitch", "roll", "yaw")
 MOUNT_FIELDS = ("x", "y", "height", *ANGLES)
-TO_FILL_IN = {  # what stands in a new file for what only the user knows
+TO_FILL_IN = {  # placeholders in a new file for what only the user knows
     "height": "fill in the metres from the floor to the lens",
     "pitch": "fill in the radians that the camera looks down",
 }
-ROUNDING = 1e-3  # radians, by which an angle of three digits may be over its limit
+ROUNDING = 1e-3  # radians: an angle rounded to three digits may exceed its limit by this
 FIRST_LINE = (  # of every camera file that is written here
     "# camera_info, with the mount of the camera on the robot: metres, radians, "
     "pitch > 0 looks down"
@@ -38,7 +38,7 @@ class CameraFile:
     distortion: np.ndarray  # [n] float64, in the order of OpenCV and ROS
     distortion_model: str  # plumb_bob, rational_polynomial or equidistant
     name: str
-    remarks: tuple[str, ...] = ()  # sentences on what the file left open
+    remarks: tuple[str, ...] = ()  # sentences on what the file does not say
 
 
 def read_camera(path: Path) -> CameraFile:
@@ -87,7 +87,7 @@ def write_intrinsics(
     mount: Mapping[str, SupportsFloat],
     notes: Sequence[str] = (),
 ) -> None:
-    """Write a camera file of whose mount only some fields may be known.
+    """Write a camera file; only some fields of its mount need be known.
 
     Where the height or the pitch is missing `TO_FILL_IN` stands in its place, and `read_camera`
     refuses the file until it is filled in.
@@ -139,7 +139,7 @@ def known_mount(path: Path) -> dict[str, float]:
 
 
 def doubts(camera_file: CameraFile) -> list[str]:
-    """Sentences on what is possible and unlikely: worth a look, no reason to refuse."""
+    """Sentences on values that are possible but unlikely."""
     camera, mount = camera_file.camera, camera_file.mount
     size = np.array([camera.width, camera.height])
     K = np.asarray(camera.K, float)
@@ -160,7 +160,7 @@ def doubts(camera_file: CameraFile) -> list[str]:
 def check_floor_in_view(
     where: str, K: np.ndarray, width: int, height: int, mount: Mapping[str, float]
 ) -> None:
-    """Refuse a mount that has the whole image above the horizon."""
+    """Refuse a mount by which the whole image lies above the horizon."""
     right, bottom = width - 1, height - 1
     corners = np.array([[0, 0, 1], [right, 0, 1], [0, bottom, 1], [right, bottom, 1]])
     if (corners @ horizon_image(K, mount["pitch"], mount["roll"]) <= 0).all():
@@ -173,7 +173,7 @@ def check_floor_in_view(
 def horizon_image(K: np.ndarray, pitch: float, roll: float) -> np.ndarray:
     """The horizon as an image line l [3]: l · (x, y, 1) > 0 for the pixels below it.
 
-    The same line as `geometry.floor.horizon`'s, to a scale, in plain numpy: it is looked at before
+    The same line as `geometry.floor.horizon`'s, to a scale, in plain NumPy, as it is used before
     anything is compiled.
     """
     down = [np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), np.sin(pitch)]

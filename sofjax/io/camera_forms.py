@@ -35,7 +35,7 @@ OTHER_NAMES = {
     "none": "none",
     "": "none",
 }
-MAX_PIXELS = 16384  # a side; more is a slip, and would fill the memory
+MAX_PIXELS = 16384  # a side; more is a typing error, and would fill the memory
 MATRIX = ("camera_matrix", "k")
 COEFFICIENTS = ("distortion_coefficients", "d", "distortion_coeffs")
 KNOWN = {
@@ -163,7 +163,7 @@ def named(fields: Mapping, names: Sequence[str]) -> dict[str, object]:
 
 
 def number(where: str, value: object) -> float:
-    """A finite number; YAML 1.1 takes '1e-5' for a word, as calibration tools write it."""
+    """A finite number; also '1e-5', which calibration tools write and YAML 1.1 reads as a word."""
     try:
         number = decimal(str("no" if isinstance(value, bool) else value))
     except (TypeError, ValueError, OverflowError):
@@ -174,14 +174,14 @@ def number(where: str, value: object) -> float:
 
 
 def _refuse_slip(path: Path, name: str, fields: Mapping) -> None:
-    """Refuse a file without a field that has one of nearly this name, which is used for nothing."""
+    """Refuse a file that has, in place of the field `name`, an unused one of nearly that name."""
     unused = [str(key) for key in fields if str(key).lower() not in KNOWN]
     for close in difflib.get_close_matches(name, unused, n=1, cutoff=0.7):
         raise InputError(f"{path}: the field '{name}' is missing; did you mean {quoted(close)}?")
 
 
 def _agreed(path: Path, given: Mapping, name: str, fields: Mapping) -> Any:
-    """The one value of what is given by several names; `name` is what to ask for if by none."""
+    """The value that all given names agree on; `name` is the one to ask for if none is given."""
     if not given:
         _refuse_slip(path, name, fields)
         raise InputError(f"{path}: the field '{name}' is missing")

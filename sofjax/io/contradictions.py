@@ -1,4 +1,4 @@
-"""What shows that an odometry as a whole is not what it is taken for: its speed and its axes."""
+"""Signs that an odometry as a whole is not as described: its speed and its axes."""
 
 import numpy as np
 
@@ -6,8 +6,8 @@ from sofjax.io.odometry import between_rows
 from sofjax.io.trajectory import Trajectory
 
 FASTEST = 60.0  # metres a second; no wheeled robot
-STRETCH = 0.1  # metres over which a direction of travel is told
-ONE_LINE = 0.6  # share of the way along one line below which a heading is none
+STRETCH = 0.1  # metres over which a direction of travel is measured
+ONE_LINE = 0.6  # share of the path along one line below which a heading is none
 SIDEWAYS = np.deg2rad(30)  # of that line to the heading
 BACKWARDS = 0.2  # share driven forward below which the robot drives backwards
 
@@ -15,17 +15,17 @@ BACKWARDS = 0.2  # share driven forward below which the robot drives backwards
 def contradictions(
     where: str, lines: np.ndarray, read: Trajectory, mended: Trajectory
 ) -> list[str]:
-    """Sentences on what shows that the odometry as a whole is not what it must be.
+    """Sentences on why the odometry as a whole cannot be right.
 
     **Arguments:** as of `mend`, and what that returned.
     """
-    dt, way, _ = between_rows(read)
+    dt, distance, _ = between_rows(read)
     found = []
-    speed = way / dt
-    if len(speed) and np.median(speed[way > 0] if way.any() else speed) > FASTEST:
+    speed = distance / dt
+    if len(speed) and np.median(speed[distance > 0] if distance.any() else speed) > FASTEST:
         i = int(np.flatnonzero(speed > FASTEST)[0])
         found.append(
-            f"{where}, line {lines[i + 1]}: {way[i]:.4g} m in {dt[i]:.3f} s are "
+            f"{where}, line {lines[i + 1]}: {distance[i]:.4g} m in {dt[i]:.3f} s are "
             f"{speed[i]:.4g} m/s, which no wheeled robot drives; are positions in millimetres?"
         )
     travel = _direction_of_travel(mended)
@@ -51,11 +51,11 @@ def contradictions(
 
 
 def _direction_of_travel(trajectory: Trajectory) -> tuple[float, float, float] | None:
-    """How much of the way lies along one line of the robot's frame, 0 to 1; the angle of that line
-    to the heading, radians in (-pi/2, pi/2]; and the share of the way that is driven forward.
+    """Share of the path along one line of the robot's frame, 0 to 1; the angle of that line to
+    the heading, radians in (-pi/2, pi/2]; and the share of the path that is driven forward.
 
-    Over stretches of `STRETCH` metres, so that a robot that stands and trembles has none; None for
-    fewer than five.
+    Measured over stretches of `STRETCH` metres, so that a robot that stands and trembles has no
+    direction; None for fewer than five.
     """
     xy, chosen = trajectory.xy, [0]
     for i, (x, y) in enumerate(xy.tolist()):
@@ -67,7 +67,7 @@ def _direction_of_travel(trajectory: Trajectory) -> tuple[float, float, float] |
     dx, dy = np.diff(xy[chosen], axis=0).T
     yaw = trajectory.yaw[chosen]
     along = (dx + 1j * dy) * np.exp(-0.5j * (yaw[:-1] + yaw[1:]))
-    way = np.abs(along)
-    line = (along**2 / way).sum() / way.sum()  # twice the angle: forward and backward are one line
-    forward = way[along.real > 0].sum() / way.sum()
+    distance = np.abs(along)
+    line = (along**2 / distance).sum() / distance.sum()  # twice the angle
+    forward = distance[along.real > 0].sum() / distance.sum()
     return float(np.abs(line)), float(np.angle(line)) / 2, float(forward)

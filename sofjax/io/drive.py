@@ -42,10 +42,10 @@ class Drive:
     camera_file: CameraFile
     image_stamps: np.ndarray  # [T] float64, seconds, strictly increasing
     image_files: list[Path]  # [T], all inside the folder; a few may be missing
-    odometry: Trajectory  # mended: without what is no motion
-    outages: list[Outage]  # times over which the odometry does not tell the motion
-    contradictions: list[str]  # sentences: why the odometry cannot be what it is taken for
-    remarks: list[str]  # sentences on what was read otherwise than it stands there
+    odometry: Trajectory  # mended: without impossible rows
+    outages: list[Outage]  # times over which the odometry does not give the motion
+    contradictions: list[str]  # sentences: why the odometry cannot be as described
+    remarks: list[str]  # sentences on what was read differently from how it is written
     groundtruth: Trajectory | None
     floor_segments: np.ndarray | None  # [S, 2, 2] float64, the true segments, world frame, metres
 
@@ -165,14 +165,14 @@ def motion_sigmas(drive: Drive) -> np.ndarray | None:
     """What is not known of the motion up to each image, beyond the odometer's noise.
 
     **Returns:** [T, 3] standard deviations (forward, sideways, turn), metres and radians, zero
-    where the odometry tells the motion; None if it always does.
+    where the odometry gives the motion; None if it always does.
     """
     speeds = usual_speeds(drive.odometry)
     return unknown_motion(drive.outages, speeds, drive.image_stamps)
 
 
 def odometry_warnings(drive: Drive) -> list[str]:
-    """Sentences on where the odometry does not tell the motion, each with the images in it."""
+    """Sentences on where the odometry does not give the motion, each with the images in it."""
     found = []
     for outage in drive.outages[:MANY]:
         edges = np.clip(drive.image_stamps, outage.begin, outage.end)
@@ -190,7 +190,7 @@ def outside(odometry: Trajectory, stamps: np.ndarray) -> np.ndarray:
 
 
 def read_odometry(path: Path) -> TrajectoryFile:
-    """The odometry as it stands in its file, of two poses or more; `mend` makes it a path."""
+    """The odometry as its file has it, of two poses or more; `mend` makes it a path."""
     if not path.exists():
         raise InputError(
             f"{path}: the wheel odometry is missing, and without it neither the motion nor the "
@@ -203,7 +203,7 @@ def read_odometry(path: Path) -> TrajectoryFile:
 
 
 def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
-    """Stamps in seconds, files, whether the stamps are nanoseconds in the list, and remarks."""
+    """Stamps in seconds, files, whether the list has nanoseconds, and remarks."""
     table, at_line = path / "rgb.txt", f"{path / 'rgb.txt'}, line "
     numbers, stamps, names = [], [], []
     for number, line in rows(table, "the list of images"):
@@ -236,7 +236,7 @@ def _read_images(path: Path) -> tuple[np.ndarray, list[Path], bool, list[str]]:
 
 
 class _Folder:
-    """What lies in a drive's folder, each folder looked at once; links must not lead out of it."""
+    """The files of a drive's folder; each folder is listed once, and links must not lead out."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

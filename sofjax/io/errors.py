@@ -1,4 +1,4 @@
-"""The one exception for what a user gave and nobody can use."""
+"""The exception for wrong input of a user."""
 
 import difflib
 from collections.abc import Iterable

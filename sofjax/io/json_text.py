@@ -1,4 +1,4 @@
-"""JSON that a user named, within bounds."""
+"""JSON files of a user, of limited size."""
 
 import json
 from collections import Counter

@@ -25,7 +25,7 @@ def whole(text: str) -> int:
 
 
 def check_segment(where: str, *ends: int | float) -> None:
-    """Refuse a segment x1, y1, x2, y2, in metres, that no floor has."""
+    """Refuse a segment x1, y1, x2, y2, metres, that is too long or too far away for a floor."""
     x1, y1, x2, y2 = ends
     if all(abs(value) <= sys.float_info.max for value in ends):
         length = math.hypot(x2 - x1, y2 - y1)

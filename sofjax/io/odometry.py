@@ -1,8 +1,8 @@
-"""What an odometer's rows cannot mean: jumps, restarts, stalls and holes, found and taken out.
+"""Jumps, restarts, stalls and holes in the rows of an odometer, found and removed.
 
-A wheel odometer is trusted from row to row, so one row that is no motion moves the whole path
-behind it. Here such rows are found by the odometer's own usual speed, the path is mended, and the
-time over which the motion is not known is told to whoever uses it.
+A wheel odometer is trusted from row to row, so one wrong row moves the whole path behind it. Here
+such rows are found by the odometer's own usual speed and the path is mended. The times over which
+the motion is not known are returned beside it.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ import numpy as np
 
 from sofjax.io.trajectory import Trajectory
 
-CLOSE = 0.2  # seconds that it may begin late or end early without a word
-NEAR = 3  # steps on either side that tell a speed
+CLOSE = 0.2  # seconds that it may begin late or end early without a warning
+NEAR = 3  # steps on either side from which a speed is taken
 MIN_ROWS = 8  # below which there is no usual speed
 USUAL = 0.8  # quantile of the speeds of a robot that moves
 MOVING = 0.02  # metres and radians a second, above which it does
@@ -26,12 +26,12 @@ ZERO = 0.02  # metres and radians about the origin: where an odometer restarts .
 FROM = 0.3  # ... if it comes from so far away in one step
 SHARE = 0.5  # of the usual speed: standard deviation of the speed that is not known
 MIN_TURN_RATE = 0.3  # radians a second, standard deviation of a turn rate that is not known
-LEAST = 0.02  # metres and radians, standard deviation of a motion that nobody read
+MIN_SIGMA = 0.02  # metres and radians, standard deviation of a motion that nobody read
 
 
 @dataclass(frozen=True)
 class Outage:
-    """A time over which the odometry does not tell the robot's motion."""
+    """A time over which the odometry does not give the robot's motion."""
 
     begin: float  # seconds
     end: float
@@ -48,7 +48,7 @@ class Speeds:
 
 
 def mend(where: str, lines: np.ndarray, read: Trajectory) -> tuple[Trajectory, list[Outage]]:
-    """The odometry without what is no motion, and the times over which the motion is not known.
+    """The odometry without impossible rows, and the times over which the motion is not known.
 
     - A pose that stands still and then catches up (a driver that stalls): its stale rows go.
     - A hole in the rows, and what a stall leaves: the straight line between its ends stays.
@@ -66,23 +66,23 @@ def mend(where: str, lines: np.ndarray, read: Trajectory) -> tuple[Trajectory, l
     lines, mended = lines[fresh], read
     if not fresh.all():
         mended = Trajectory(read.stamps[fresh], read.xy[fresh], np.unwrap(read.yaw[fresh]))
-    dt, way, turn = between_rows(mended)
+    dt, distance, turn = between_rows(mended)
     speeds = usual_speeds(mended)
     period = float(np.median(np.diff(read.stamps)))
     hole = dt > max(HOLE_PERIODS * period, HOLE_SECONDS)
     restart = _restarts(mended)
-    jump = restart | _too_far(dt, way, turn, speeds, period)
+    jump = restart | _too_far(dt, distance, turn, speeds, period)
 
     outages = []
     for i in np.flatnonzero(hole | jump):
         begin, end = float(mended.stamps[i]), float(mended.stamps[i + 1])
         at = f"{where}, line {lines[i + 1]}"
         if restart[i]:
-            what = f"the odometry restarts at the origin, {way[i]:.2f} m from the row before"
+            what = f"the odometry restarts at the origin, {distance[i]:.2f} m from the row before"
         elif jump[i]:
             usual = f"usually {speeds.forward:.2f} m and {np.degrees(speeds.turn):.0f}° a second"
             what = (
-                f"a step of {way[i]:.2f} m and {np.degrees(turn[i]):.0f}° in {dt[i]:.3f} s "
+                f"a step of {distance[i]:.2f} m and {np.degrees(turn[i]):.0f}° in {dt[i]:.3f} s "
                 f"({usual})"
             )
         elif not fresh[np.searchsorted(read.stamps, begin) + 1]:
@@ -134,21 +134,21 @@ def _with_pose(odometry: Trajectory, i: int, stamp: float, twist: np.ndarray) ->
 
 
 def usual_speeds(trajectory: Trajectory) -> Speeds:
-    """The speeds below which it is for four fifths of the time that it moves."""
-    dt, way, turn = between_rows(trajectory)
+    """The speeds that the robot stays below for four fifths of the time that it moves."""
+    dt, distance, turn = between_rows(trajectory)
 
     def usual(rate: np.ndarray) -> float:
         moving = rate[rate > MOVING]
         return float(np.quantile(moving, USUAL)) if len(moving) else 0.0
 
-    return Speeds(usual(way / dt), usual(turn / dt))
+    return Speeds(usual(distance / dt), usual(turn / dt))
 
 
 def unknown_motion(outages: list[Outage], speeds: Speeds, stamps: np.ndarray) -> np.ndarray | None:
     """What is not known of the motion up to each image, as standard deviations; None if nothing.
 
-    In an outage the robot's speed may be off by half the usual one; if both ends are known, the
-    whole of it is, and only the way between them is not (as of a Brownian bridge).
+    In an outage the robot's speed may be off by half the usual one. If both ends are known, the
+    whole motion is known, and only the path between them is not (a Brownian bridge).
 
     **Arguments:**
     - `stamps`: [T] of the images, seconds.
@@ -162,26 +162,26 @@ def unknown_motion(outages: list[Outage], speeds: Speeds, stamps: np.ndarray) ->
         seconds = np.diff(edges, prepend=edges[:1])[:, None]
         share = seconds / (outage.end - outage.begin)
         variance += (rate * seconds) ** 2 * ((1 - share) if outage.bridged else 1)
-        variance += 0 if outage.bridged else share * LEAST**2
+        variance += 0 if outage.bridged else share * MIN_SIGMA**2
     return np.sqrt(variance) if variance.any() else None
 
 
 def between_rows(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Seconds, metres and radians (both positive) from each row to the next."""
-    way = np.hypot(*np.diff(trajectory.xy, axis=0).T)
-    return np.diff(trajectory.stamps), way, np.abs(np.diff(trajectory.yaw))
+    distance = np.hypot(*np.diff(trajectory.xy, axis=0).T)
+    return np.diff(trajectory.stamps), distance, np.abs(np.diff(trajectory.yaw))
 
 
 def _stale(trajectory: Trajectory) -> np.ndarray:
     """[n] bool, rows that repeat the pose before while the robot drove on, as the next shows."""
-    dt, way, turn = between_rows(trajectory)
+    dt, distance, turn = between_rows(trajectory)
     stale = np.zeros(len(trajectory.stamps), bool)
-    still = (way == 0) & (turn == 0)
+    still = (distance == 0) & (turn == 0)
     edges = np.diff(np.concatenate([[0], still.astype(int), [0]]))
     period = float(np.median(dt))
-    so_far = [np.append(0.0, np.cumsum(step)) for step in (way, turn)]
+    so_far = [np.append(0.0, np.cumsum(step)) for step in (distance, turn)]
     for begin, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
-        if begin == 0 or end == len(dt):  # nothing before or behind tells
+        if begin == 0 or end == len(dt):  # no row before or behind to compare with
             continue
         now, seconds = (
             trajectory.stamps[begin],
@@ -191,7 +191,7 @@ def _stale(trajectory: Trajectory) -> np.ndarray:
         before = [s[begin] - np.interp(since, trajectory.stamps, s) for s in so_far]
         caught_up = any(
             step[end] > CAUGHT_UP * driven * seconds / (now - since) > 0
-            for step, driven in zip((way, turn), before, strict=True)
+            for step, driven in zip((distance, turn), before, strict=True)
         )
         if seconds - dt[end] > STALE_PERIODS * period and caught_up:
             stale[begin + 1 : end + 1] = True
@@ -199,18 +199,18 @@ def _stale(trajectory: Trajectory) -> np.ndarray:
 
 
 def _too_far(
-    dt: np.ndarray, way: np.ndarray, turn: np.ndarray, speeds: Speeds, period: float
+    dt: np.ndarray, distance: np.ndarray, turn: np.ndarray, speeds: Speeds, period: float
 ) -> np.ndarray:
     """[n - 1] bool, steps far longer than the robot's usual speed and that around them allow."""
     around = np.lib.stride_tricks.sliding_window_view
     longer = np.maximum(dt, period)
 
-    def beyond(step: np.ndarray, usual: float, least: float, slack: float) -> np.ndarray:
+    def beyond(step: np.ndarray, usual: float, minimum: float, slack: float) -> np.ndarray:
         local = np.median(around(np.pad(step / dt, 3, mode="edge"), 7), axis=1)
-        fast = np.maximum(FASTER * np.maximum(usual, local), least)
+        fast = np.maximum(FASTER * np.maximum(usual, local), minimum)
         return step > fast * longer + slack
 
-    return beyond(way, speeds.forward, SPEED, SLACK_XY) | beyond(
+    return beyond(distance, speeds.forward, SPEED, SLACK_XY) | beyond(
         turn, speeds.turn, TURN_RATE, SLACK_YAW
     )
 
@@ -219,8 +219,8 @@ def _restarts(trajectory: Trajectory) -> np.ndarray:
     """[n - 1] bool, steps that end where odometers begin and come from far away."""
     pose = np.column_stack([trajectory.xy, np.angle(np.exp(1j * trajectory.yaw))])
     at_origin = np.all(np.abs(pose) < ZERO, axis=1)
-    _, way, _ = between_rows(trajectory)
-    return at_origin[1:] & ~at_origin[:-1] & (way > FROM)
+    _, distance, _ = between_rows(trajectory)
+    return at_origin[1:] & ~at_origin[:-1] & (distance > FROM)
 
 
 def _without(trajectory: Trajectory, jump: np.ndarray) -> Trajectory:

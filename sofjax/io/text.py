@@ -1,4 +1,4 @@
-"""Reading a text file that a user named, and writing one that is never found half written."""
+"""Reading a text file that a user named, and writing files whole or not at all."""
 
 import itertools
 import os

@@ -44,12 +44,12 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class TrajectoryFile:
-    """A trajectory, and how it stands in its file."""
+    """A trajectory, and how its file has it."""
 
     trajectory: Trajectory
     lines: np.ndarray  # [n] the line of each pose
-    nanoseconds: bool  # what its timestamps are in the file
-    remarks: list[str]  # sentences on what was read otherwise than it stands there
+    nanoseconds: bool  # whether the file's timestamps are nanoseconds, not seconds
+    remarks: list[str]  # sentences on what was read differently from how it is written
 
 
 def read_trajectory(path: Path, what: str = "a trajectory") -> Trajectory:
@@ -180,7 +180,7 @@ def _row(stamp: float, xy: np.ndarray, yaw: float) -> str:
 class TrajectoryWriter:
     """Writes rows as they come, each one complete on the disk before the next.
 
-    The file is made with the first row. Where there is no room for a row, such as on a full disk,
+    The file is made with the first row. Where there is no space for a row, such as on a full disk,
     the file ends with the row before, and the `OSError` names the file.
     """
 
@@ -198,8 +198,8 @@ class TrajectoryWriter:
             while left:
                 left = left[self._file.write(left) :]
         except OSError as error:
-            with contextlib.suppress(OSError):  # what is no regular file cannot be cut
-                self._file.truncate(self._size)  # a part of the row may have had room
+            with contextlib.suppress(OSError):  # only a regular file can be truncated
+                self._file.truncate(self._size)  # a part of the row may have been written
             error.filename = str(self._path)
             raise
         self._size += len(data)

@@ -121,20 +121,19 @@ def calibrate_drive(
             fitted, covariance = _jointly(camera, found, log, free)
         residuals = np.asarray(found.fit.residuals)[np.asarray(found.pairs.valid)]
     doubt = "; ".join([
-        *filter(None, [doubts(found.fit)]),
+        *filter(None, [doubts(found.fit, config.fit)]),
         *fitted_height(float(fitted.height), float(mount.height)),
     ])  # fmt: skip
     evidence = f"{len(residuals)} of {found.related} pairs of segments taken for floor"
     evidence += ", then jointly with poses and lines" * (usable and joint)
     fields = (jnp.asarray(value, float) for value in dataclasses.astuple(fitted))
+    known = _accuracy(fitted, covariance) + f"; {doubt}" * bool(doubt)
     verdict = FitVerdict.DOUBTFUL if doubt else FitVerdict.GOOD
     return Calibration(
         drive=drive,
         camera_file=dataclasses.replace(drive.camera_file, mount=type(fitted)(*fields)),
         verdict=verdict if usable else FitVerdict.NOT_USABLE,
-        sentence=_accuracy(fitted, covariance) + f"; {doubt}" * bool(doubt)
-        if usable
-        else assessment.sentence,
+        sentence=known if usable else assessment.sentence,
         evidence=evidence,
         estimates=estimates(fitted, odometer, covariance, config.fit.free),
         residual_px=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.nan,

@@ -14,7 +14,7 @@ from sofjax.io.drive import Drive
 from sofjax.pipeline.settings import RunSettings
 from sofjax.slam import SofSlam
 from sofjax.slam.state import SlamState, StepInfo
-from sofjax.vision import Frontend, View, observations
+from sofjax.vision import Frontend, ImageSegments, observations
 
 AHEAD = 8  # images that are searched for segments before the filter asks for them
 
@@ -22,7 +22,7 @@ AHEAD = 8  # images that are searched for segments before the filter asks for th
 class Frame(NamedTuple):
     """One image done."""
 
-    view: View
+    view: ImageSegments
     observation: Observation
     info: StepInfo  # on the host
     seconds: dict[str, float]  # that it waited for the view, and that the step took
@@ -45,7 +45,7 @@ def steps(settings: RunSettings, drive: Drive, frontend: Frontend) -> Iterator[F
             begun = time.perf_counter()
 
 
-def views(frontend: Frontend, files: Sequence[Path]) -> Generator[View, None, None]:
+def views(frontend: Frontend, files: Sequence[Path]) -> Generator[ImageSegments, None, None]:
     """The views of the images in order, made ahead of time by a thread of their own."""
     worker = ThreadPoolExecutor(max_workers=1)
     try:

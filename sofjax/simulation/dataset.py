@@ -47,9 +47,9 @@ def record(
         )
         for i, (stamp, R_world_camera, C, turn_rate) in enumerate(progress(list(frames))):
             write_image(beside / _image_name(i), renderer.draw(R_world_camera, C, stamp, turn_rate))
-        os.rename(beside, path)  # takes the place of an empty folder, and of nothing else
+        os.rename(beside, path)  # replaces an empty folder, and nothing else
     except OSError as error:
-        error.filename, error.filename2 = str(path), None  # the user knows no other
+        error.filename, error.filename2 = str(path), None  # the only path the user knows
         raise
     finally:
         shutil.rmtree(beside, ignore_errors=True)

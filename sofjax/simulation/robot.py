@@ -94,7 +94,7 @@ def _number(default: float) -> Any:
 
 
 class Odometer(eqx.Module):
-    """What wheels report: scales that are wrong, a bent straight, noise and slip.
+    """What wheels report: wrong scales, a drift to one side, noise and slip.
 
     The defaults are those of the paper's robot: fair on straights, and corners to the right
     read as more than they were, so that the path spins inward.
@@ -111,7 +111,7 @@ class Odometer(eqx.Module):
 
     @jax.jit
     def read(self, motions: SE2, key: PRNGKeyArray) -> SE2:
-        """The readings of a run of motions; their noise adds up alike however they are cut.
+        """The readings of motions; their noise adds up to the same however the path is divided.
 
         **Arguments:**
         - `motions`: T_previous_current, true, with one axis T in front.
@@ -167,5 +167,5 @@ def read_path(odometer: Odometer, truth: Trajectory, key: PRNGKeyArray) -> Traje
 
 
 def clearance(walls: Float[np.ndarray, "walls 2 2"], truth: Trajectory) -> float:
-    """Least distance of a path from the walls, metres."""
+    """Smallest distance of a path from the walls, metres."""
     return float(min(distance_to_path(wall, truth.xy).min() for wall in walls))

@@ -11,7 +11,7 @@ from sofjax.vision.detectors import detect_hough as detect_hough
 from sofjax.vision.detectors import detect_lsd as detect_lsd
 from sofjax.vision.frontend import Frontend as Frontend
 from sofjax.vision.frontend import FrontendSettings as FrontendSettings
-from sofjax.vision.frontend import View as View
+from sofjax.vision.frontend import ImageSegments as ImageSegments
 from sofjax.vision.frontend import pack as pack
 from sofjax.vision.images import read_image as read_image
 from sofjax.vision.lens import Lens as Lens

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 PATTERNS = ("chessboard", "circles", "acircles", "charuco")
-WINDOW = 0.4  # of the way to the next corner, within which one is refined ...
-MAX_WINDOW = 11  # ... in pixels at most: farther out the lens bends the lines
+WINDOW = 0.4  # half side of the window that refines a corner, share of the distance to the next
+MAX_WINDOW = 11  # pixels, its largest half side: in larger ones the lens bends the lines
 MIN_POINTS = 8  # of a ChArUco board, of which an image may show a part
 MIN_BLOB_GAP = 4  # pixels between the middles of circles
 SETS = (  # of ChArUco's markers; of each row the first that has enough of them
@@ -73,7 +73,7 @@ def find_points(image: np.ndarray, board: Board) -> Correspondences | None:
 
 
 def recognise(board: Board, images: Iterable[np.ndarray]) -> Board:
-    """A ChArUco board with the set of markers by which most of it is seen; others as they are."""
+    """A ChArUco board with the set of markers that shows most of it; other boards unchanged."""
     if board.pattern != "charuco":
         return board
     count = board.columns * board.rows // 2
@@ -95,7 +95,7 @@ def _chessboard(image: np.ndarray, board: Board) -> np.ndarray | None:
     """Corners [N, 2] in the order of the board's, pixels.
 
     Found by OpenCV's sector-based search, or else by its older one, then refined where the edges
-    around each cross, within a window that no other corner reaches into.
+    around each cross, within a window without any other corner.
     """
     size = (board.columns, board.rows)
     search = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -147,7 +147,7 @@ def _charuco(
 @functools.lru_cache
 def _charuco_detector(board: Board, dictionary: str, legacy: bool) -> cv2.aruco.CharucoDetector:
     whole, count = _markers(dictionary), board.columns * board.rows // 2
-    # its first markers are those of the board, and many are slow to tell apart
+    # the board has the first markers of the set, and fewer are faster to distinguish
     markers = cv2.aruco.Dictionary(
         whole.bytesList[:count], whole.markerSize, whole.maxCorrectionBits
     )

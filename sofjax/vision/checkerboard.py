@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
 import cv2
@@ -12,7 +13,7 @@ from sofjax.vision.boards import Board, Correspondences
 MIN_VIEWS = 5
 OUTLIER = 3.0  # times the median error of the views
 NEGLIGIBLE = 0.1  # pixels, below which no view is an outlier
-MIN_TILT = 10.0  # degrees, below which focal length and distance cannot be told apart
+MIN_TILT = 10.0  # degrees, below which focal length and distance cannot be separated
 SIGNIFICANT = 2.0  # standard deviations from 0 without which k3 is left out
 TERMS = ("k1", "k2", "p1", "p2", "k3")
 
@@ -66,7 +67,7 @@ class CameraFit:
 def fit_camera(
     board: Board, width: int, height: int, names: list[str], found: list[Correspondences]
 ) -> CameraFit:
-    """Intrinsics from what some views show; views that do not go with the others are left out.
+    """Intrinsics from the views of a board; views that contradict the others are left out.
 
     **Raises:** `ValueError` if OpenCV finds no camera that could have taken them.
     """
@@ -107,9 +108,9 @@ class _Solution:
 
 
 def _solve(width: int, height: int, found: list[Correspondences]) -> _Solution:
-    """One fit; k3 is zero unless the views speak for it: far from the corners it runs away.
+    """One fit; k3 is zero unless it is significant: far from the corners it diverges.
 
-    It is zero too where by it the lens would turn back within the image, which no lens does.
+    It is zero too if with it the lens would turn back within the image, which no lens does.
     """
     no_guess: Any = None  # OpenCV's stubs want a matrix here
     for flags in (0, cv2.CALIB_FIX_K3):
@@ -127,8 +128,8 @@ def _solve(width: int, height: int, found: list[Correspondences]) -> _Solution:
         sigma, distortion = sigma.ravel()[:9], distortion.ravel()[:5]
         if not (np.isfinite(K).all() and np.isfinite(sigma).all() and math.isfinite(error)):
             raise ValueError("no camera explains these views of the board")
-        spoken_for = abs(distortion[4]) > SIGNIFICANT * sigma[8]
-        if spoken_for and turning_radius(K, distortion, width, height) is None:
+        significant = abs(distortion[4]) > SIGNIFICANT * sigma[8]
+        if significant and turning_radius(K, distortion, width, height) is None:
             break
     poses = list(zip(R, t, strict=True))
     return _Solution(K, distortion, sigma, poses, errors.ravel(), float(error))
@@ -168,16 +169,24 @@ def _view(
     return BoardView(name, seen.corners, residuals, distance, math.acos(facing), bool(pose))
 
 
+class CameraVerdict(StrEnum):
+    """What a fitted camera is worth."""
+
+    GOOD = "good"
+    USABLE = "usable"
+    NOT_USABLE = "not usable"
+
+
 @dataclass(frozen=True)
 class Verdict:
-    """What a fit is worth, in words."""
+    """What a fit is worth, with the reasons."""
 
-    word: str  # good, usable or not usable
+    word: CameraVerdict
     reasons: list[str]  # how well the camera is known, and what would make it better
 
     @property
     def usable(self) -> bool:
-        return self.word != "not usable"
+        return self.word is not CameraVerdict.NOT_USABLE
 
     @property
     def sentence(self) -> str:
@@ -185,7 +194,7 @@ class Verdict:
 
 
 def judge(fit: CameraFit) -> Verdict:
-    """Say what a fit is worth: by its standard deviations, its residuals and its views."""
+    """What a fit is worth, by its standard deviations, its residuals and its views."""
     used = [view for view in fit.views if view.used]
     size = np.array([fit.width, fit.height])
     share, centre = fit.focal_uncertainty, float((fit.intrinsics_sigma[2:] / size).max())
@@ -215,12 +224,13 @@ def judge(fit: CameraFit) -> Verdict:
             "lens does: take views that reach the corners"
         )
     off = float(np.abs(np.array([cx, cy]) / size - 0.5).max())
-    if tilt < MIN_TILT:  # the fit may then rest far from the truth, and the sigmas do not tell
-        word, known = "not usable", "the views do not fix the focal length"
+    if tilt < MIN_TILT:  # the fit may then end far from the truth, with small sigmas
+        word, known = CameraVerdict.NOT_USABLE, "the views do not fix the focal length"
     elif share > 0.03 or centre > 0.05 or abs(fx / fy - 1) > 0.2 or off > 0.35:
-        word, known = "not usable", "the views do not fix the camera"
+        word, known = CameraVerdict.NOT_USABLE, "the views do not fix the camera"
     else:
-        word = "usable" if advice or share > 0.005 else "good"
+        rough = bool(advice) or share > 0.005
+        word = CameraVerdict.USABLE if rough else CameraVerdict.GOOD
         known = (
             f"the focal length is known to {100 * share:.2g} % and the centre to "
             f"{fit.intrinsics_sigma[2:].max():.2g} px"

@@ -25,7 +25,7 @@ class FrontendSettings:
 
     detector: str = "lsd"  # a name of `DETECTORS`: 'lsd', or 'hough' as in the paper
     capacity: int = 64  # M, segments of an image that are kept
-    min_length: float = 12.0  # pixels, below which a segment tells little of a direction
+    min_length: float = 12.0  # pixels: shorter segments have no useful direction
 
     def __post_init__(self) -> None:
         if self.detector not in DETECTORS:
@@ -39,13 +39,13 @@ class FrontendSettings:
 
 
 @dataclass(frozen=True)
-class View:
+class ImageSegments:
     """What the front end makes of one image."""
 
     segments_image: Segments  # capacity M, pixels of the undistorted image
     overflow: int  # segments that found no place
     detected: int  # segments before packing
-    fault: str  # why it tells nothing: unreadable, of another size, a repetition; "" if it does
+    fault: str  # why it is not used: unreadable, another size, a repetition; "" if it is
     seconds: dict[str, float]  # of each stage
 
     @property
@@ -101,7 +101,7 @@ class Frontend:
         found = self.lens.clip(found[np.isfinite(found).all(1)])
         return found[lengths(found) >= self.settings.min_length]
 
-    def view(self, path: Path) -> View:
+    def view(self, path: Path) -> ImageSegments:
         """One image's file, decoded, undistorted, searched and packed."""
         clock = [time.perf_counter()]
         image = read_image(path, self.bits)
@@ -119,7 +119,7 @@ class Frontend:
         clock.append(time.perf_counter())
         stages = ("decode", "undistort", "detect")
         seconds: dict[str, float] = dict(zip(stages, np.diff(clock).tolist(), strict=True))
-        return View(packed, overflow, len(segments), fault, seconds)
+        return ImageSegments(packed, overflow, len(segments), fault, seconds)
 
     def _fault(self, image: np.ndarray | None) -> str:
         camera = self.camera_file.camera

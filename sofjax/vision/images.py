@@ -58,7 +58,7 @@ def bit_depth(drive: Drive) -> int:
 
 
 def depth(image: np.ndarray) -> int:
-    """How many bits the largest value of an image takes, 8 at least."""
+    """How many bits the largest value of an image needs, at least 8."""
     return max(8, int(image.max()).bit_length())
 
 

@@ -7,7 +7,7 @@ from sofjax.io.camera_file import CameraFile
 from sofjax.io.errors import InputError, quoted
 
 SAMPLES = 33  # points of a segment that are looked up in the mask of what the lens saw
-MARGIN = 3  # pixels by which a detector's smoothing reaches over the edge of that
+MARGIN = 3  # pixels beside its edge that a detector's smoothing mixes
 
 
 class Lens:
@@ -30,7 +30,7 @@ class Lens:
             )
 
     def undistort(self, image: np.ndarray) -> np.ndarray:
-        """The undistorted image, of the same size; beyond what the lens saw, its edge goes on."""
+        """The undistorted image, of the same size; outside the lens's view its edge is repeated."""
         return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def undistort_points(self, points: np.ndarray) -> np.ndarray:
@@ -58,7 +58,8 @@ def _seen(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """[height, width] bool: pixels of the undistorted image that the lens has seen.
 
     Beyond a certain angle the polynomial of a lens may turn back, and shows the image again,
-    mirrored: the determinant of the map's Jacobian tells, and what is joined to the middle stays.
+    mirrored. There the determinant of the map's Jacobian is negative. What is connected to the
+    middle of the image stays.
     """
     height, width = x.shape
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)

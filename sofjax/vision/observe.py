@@ -10,12 +10,14 @@ import numpy as np
 from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Segments
 from sofjax.io.drive import Drive, motion_sigmas, motions
-from sofjax.vision.frontend import REPEATED, Frontend, View
+from sofjax.vision.frontend import REPEATED, Frontend, ImageSegments
 
-MOVED_XY, MOVED_YAW = 0.01, 0.01  # metres and radians, beyond which an image cannot stay the same
+MOVED_XY, MOVED_YAW = 0.01, 0.01  # metres and radians: after a larger motion the image must change
 
 
-def observation(view: View, motion: np.ndarray, sigma: np.ndarray | None = None) -> Observation:
+def observation(
+    view: ImageSegments, motion: np.ndarray, sigma: np.ndarray | None = None
+) -> Observation:
     """One image's observation.
 
     **Arguments:**
@@ -31,16 +33,19 @@ def observation(view: View, motion: np.ndarray, sigma: np.ndarray | None = None)
     )
 
 
-def observations(drive: Drive, views: Iterable[View]) -> Iterator[tuple[View, Observation]]:
+def observations(
+    drive: Drive, views: Iterable[ImageSegments]
+) -> Iterator[tuple[ImageSegments, Observation]]:
     """Each view of a drive with its observation; a view that repeats the last one is emptied."""
     steps, sigmas = motions(drive), motion_sigmas(drive)
     for i, view in enumerate(without_repeats(views, steps)):
         yield view, observation(view, steps[i], None if sigmas is None else sigmas[i])
 
 
-def without_repeats(views: Iterable[View], steps: np.ndarray) -> Iterator[View]:
-    """Views in order; one that shows the very segments of the last although the robot has moved
-    since tells nothing: a camera, or its driver, is stuck.
+def without_repeats(views: Iterable[ImageSegments], steps: np.ndarray) -> Iterator[ImageSegments]:
+    """Views in order; one with exactly the last one's segments after a motion is emptied.
+
+    Then the camera, or its driver, is stuck.
 
     **Arguments:**
     - `steps`: [T, 3], the odometer's motion up to each image.
@@ -56,12 +61,12 @@ def without_repeats(views: Iterable[View], steps: np.ndarray) -> Iterator[View]:
         yield view
 
 
-def _same(a: View, b: View) -> bool:
+def _same(a: ImageSegments, b: ImageSegments) -> bool:
     first, second = (np.asarray(view.segments_image.endpoints) for view in (a, b))
     return 0 < a.detected == b.detected and np.array_equal(first, second)
 
 
-def _emptied(view: View) -> View:
+def _emptied(view: ImageSegments) -> ImageSegments:
     none = Segments(
         jnp.zeros_like(view.segments_image.endpoints), jnp.zeros_like(view.segments_image.valid)
     )

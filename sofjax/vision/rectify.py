@@ -1,4 +1,4 @@
-"""The floor seen from above, out of one image."""
+"""The floor seen from above, from one image."""
 
 import cv2
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ def rectify(
     - `T_floor_robot`: [3] pose (x, y, yaw) of the robot in the frame of `extent`.
     - `extent`: x from, x to, y from, y to in metres: up and left in the result.
 
-    **Returns:** grey, `pixels` high; zero where the image does not reach.
+    **Returns:** grey, `pixels` high; zero outside of the image.
     """
     x0, x1, y0, y1 = extent
     width = round(pixels * (y1 - y0) / (x1 - x0))

@@ -126,11 +126,11 @@ def cast(
 
     first = rays.shape[1] // len(RAYS)
     dx, dy, dz, nearest, floor = (v[:first] for v in (dx, dy, dz, nearest, floor))
-    reach = (1 + frame.ceiling / height) / jnp.maximum(floor, 1e-4)  # to the mirrored ceiling
+    beyond = (1 + frame.ceiling / height) / jnp.maximum(floor, 1e-4)  # to the mirrored ceiling
     grazing = 1 + dz / jnp.sqrt(dx * dx + dy * dy + dz * dz)
-    mirrors = (floor > nearest) & (nearest * reach < 1)
+    mirrors = (floor > nearest) & (nearest * beyond < 1)
     strength = jnp.where(mirrors, frame.gloss * (0.1 + 0.9 * grazing**3), 0)
-    spread = [reach * share for share in SPREAD]
+    spread = [beyond * share for share in SPREAD]
     x, y = frame.C[:2] - frame.corner
     mirror_columns = jnp.stack([(x + r * dx) * MIRROR_TEXELS - 0.5 for r in spread])
     mirror_rows = jnp.stack([(y + r * dy) * MIRROR_TEXELS - 0.5 for r in spread])

@@ -1,4 +1,4 @@
-"""Every surface of a world painted into one image, the atlas, where rays find their colours."""
+"""All surfaces of a world, painted into one image, the atlas, from which rays take colours."""
 
 from dataclasses import dataclass
 
@@ -11,8 +11,8 @@ from sofjax.simulation.world.types import World, line_corners, outline, rectangl
 TEXELS = 200.0  # per metre, on floors and walls
 CEILING_TEXELS = 40.0
 FAR_SHRINK = 4  # floor texels that one texel of the floor's second, coarse picture covers
-MOST_TEXELS = 40e6  # of the floor's picture; a larger world is painted more coarsely
-MARGIN = 2  # texels around every picture, so that its neighbour does not shine in
+MAX_TEXELS = 40e6  # of the floor's picture; a larger world is painted more coarsely
+MARGIN = 2  # texels around every picture, so that interpolation never mixes two pictures
 NOISE_SIDE = 1024
 
 
@@ -63,7 +63,7 @@ def paint_atlas(world: World, seed: int = 0) -> Atlas:
     noise = grain(rng)
     low, high = world.corridors[:, :2].min(0), world.corridors[:, 2:].max(0)
     size = high - low
-    texels = min(TEXELS, float(np.sqrt(MOST_TEXELS / size.prod())))
+    texels = min(TEXELS, float(np.sqrt(MAX_TEXELS / size.prod())))
     light = Light(world)
     sheet = _Sheet(columns=int(size[0] * texels) + 2 * MARGIN + 2)
 
@@ -129,7 +129,7 @@ class _Sheet:
 
 
 class Light:
-    """How bright the lamps make each place of the plan, 1 in the middle of a good stretch."""
+    """Brightness of each place of the plan under the lamps; 1 is usual."""
 
     def __init__(self, world: World) -> None:
         self._centres = (world.lamps[:, :2] + world.lamps[:, 2:]) / 2
@@ -157,7 +157,7 @@ class Light:
 
 
 def grain(rng: np.random.Generator) -> Float[np.ndarray, "side side"]:
-    """A texture that repeats without a seam, from coarse mottling to single texels; variance 1."""
+    """A periodic texture, from coarse mottling to single texels; variance 1."""
     frequency = np.hypot(
         *np.meshgrid(np.fft.fftfreq(NOISE_SIDE), np.fft.rfftfreq(NOISE_SIDE), indexing="ij")
     )

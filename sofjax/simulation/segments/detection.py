@@ -1,9 +1,9 @@
-"""What a line detector makes of the edges that are in view, and how it errs.
+"""The segments that a line detector finds of the edges in view, with its errors.
 
-A line of some millimetres is seen as its two edges. It is w pixels broad in the image, less the
-farther it is, and a blur of standard deviation b leaves the share erf(w / √8 b) of its contrast:
-it fades with distance. The two slopes that are left have their middles w / share apart, on either
-side of the line: that is √(2π) b for the finest line and w for a broad one.
+A line of some millimetres is detected as its two edges. It is w pixels broad in the image. A blur
+of standard deviation b leaves the share erf(w / √8 b) of its contrast, so it fades with distance.
+The middles of its two blurred edges are w / share apart: √(2π) b for the finest line and w for a
+broad one.
 """
 
 import equinox as eqx
@@ -22,8 +22,8 @@ FALSE_SLOTS = 8  # false segments of an image at most
 class Detection(eqx.Module):
     """How a line detector errs; the defaults are those of LSD on 320×240 pixels.
 
-    `blur` and the contrasts were found on drawn images of fine lines; that the filter errs on such
-    segments as on the images of the same drives is shown by `experiments/ablation`.
+    `blur` and the contrasts were measured on drawn images of fine lines. The ablation study
+    compares the filter's errors on such segments with those on images of the same drives.
     """
 
     noise: float = 0.25  # pixels, standard deviation of an end across the line
@@ -51,7 +51,7 @@ LSD = Detection()
 def break_up(
     segment: Float[Array, "2 2"], draws: Float[Array, "3"], broken: Float[Array, ""] | float
 ) -> tuple[Float[Array, "2 2 2"], Bool[Array, "2"]]:
-    """One piece, or two with a gap, and which of the two are there; by three draws from 0 to 1."""
+    """One piece, or two with a gap, and which of the two exist; by three draws from 0 to 1."""
     chance, place, gap = draws
     breaks = chance < broken
     middle = 0.2 + 0.6 * place
@@ -67,9 +67,9 @@ def breadth_in_image(
     width: Float[Array, ""],
     P: Float[Array, "3 4"],
 ) -> Float[Array, ""]:
-    """How broad a floor line of some width is in the image, as pixels × metres of depth.
+    """Breadth of a floor line in the image, in pixels × metres of depth.
 
-    Across a straight line in the image this is the same all along it.
+    It is the same all along the line.
     """
     line = jnp.cross(homogeneous[0], homogeneous[1])
     across = jnp.append(normal_of(edge_world[:, :2]), 0)
@@ -77,7 +77,7 @@ def breadth_in_image(
 
 
 def share_left(w: Float[Array, "*any"], blur: Float[Array, ""] | float) -> Float[Array, "*any"]:
-    """Share of its contrast that a line `w` pixels broad keeps when blurred."""
+    """Share of its contrast that is left of a line `w` pixels broad after the blur."""
     return jax.scipy.special.erf(w / (8**0.5 * blur))
 
 
@@ -87,7 +87,7 @@ def seen_until(
     wanted: Float[Array, "*#any"] | Float[Array, ""] | float,
     detection: Detection,
 ) -> Float[Array, "*#any"]:
-    """Depth in metres at which an edge's contrast falls to what is wanted; 0 if it is less at once.
+    """Depth in metres up to which an edge has the wanted contrast; 0 if it never has.
 
     A line without breadth is an edge that does not fade, seen to `max_depth`.
     """
@@ -104,28 +104,28 @@ def both_edges(
     homogeneous: Float[Array, "2 3"],
     part: Float[Array, "2"],
     breadth: Float[Array, ""],
-    reach: Float[Array, "2"],
+    depth_seen: Float[Array, "2"],
     blur: Float[Array, ""] | float,
 ) -> tuple[Float[Array, "2 2 2"], Bool[Array, "2"]]:
-    """The two edges of a fine line, beside its middle in the image, and which of them are there.
+    """The two edges of a fine line in the image, and which of them exist.
 
     They run in opposite directions, as with the darker side on one hand.
 
     **Arguments:**
     - `part`: shares (from, to) of the line that are in view.
-    - `reach`: depth in metres to which either edge is seen.
+    - `depth_seen`: depth in metres to which either edge is seen.
     """
     depth = homogeneous[:, 2]
 
-    def edge(reach: Float[Array, ""], side: Float[Array, ""]) -> tuple[Array, Array]:
-        near = where_positive(reach - depth)
+    def edge(depth_seen: Float[Array, ""], side: Float[Array, ""]) -> tuple[Array, Array]:
+        near = where_positive(depth_seen - depth)
         seen = jnp.stack([jnp.maximum(part[0], near[0]), jnp.minimum(part[1], near[1])])
         ends = project(homogeneous, seen)
         w = breadth / jnp.maximum(depth[0] + seen * (depth[1] - depth[0]), NEAREST_DEPTH)
         away = jnp.maximum(w, 1e-3) / share_left(jnp.maximum(w, 1e-3), blur) / 2
         return ends + side * away[:, None] * normal_of(ends)[None], seen[1] > seen[0]
 
-    ends, there = jax.vmap(edge)(reach, jnp.array([1.0, -1.0]))
+    ends, there = jax.vmap(edge)(depth_seen, jnp.array([1.0, -1.0]))
     return jnp.stack([ends[0], ends[1, ::-1]]), there
 
 
@@ -138,22 +138,22 @@ def normal_of(segment: Float[Array, "2 2"]) -> Float[Array, "2"]:
 def invent(
     camera: Camera, detection: Detection, key: PRNGKeyArray
 ) -> tuple[Float[Array, "false 2 2"], Bool[Array, "false"]]:
-    """Segments of nothing, anywhere in the picture and in any direction."""
+    """False segments, anywhere in the picture and in any direction."""
     count_key, place_key, angle_key, length_key = jax.random.split(key, 4)
     there = jax.random.uniform(count_key, (FALSE_SLOTS,)) < detection.false_segments / FALSE_SLOTS
     size = jnp.array([camera.width - 1, camera.height - 1], float)
     middle = jax.random.uniform(place_key, (FALSE_SLOTS, 2)) * size[None]
     angle = jax.random.uniform(angle_key, (FALSE_SLOTS,)) * jnp.pi
     half = detection.shortest / 2 + 10 * jax.random.exponential(length_key, (FALSE_SLOTS,))
-    reach = half[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    ends = jnp.stack([middle - reach, middle + reach], axis=1)
+    offset = half[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    ends = jnp.stack([middle - offset, middle + offset], axis=1)
     return jnp.clip(ends, 0, size[None, None]), there
 
 
 def disturb(
     segment: Float[Array, "2 2"], draws: Float[Array, "2 2"], detection: Detection
 ) -> Float[Array, "2 2"]:
-    """Noise across the line at both ends, and each end drawn in along it; by normal draws."""
+    """The segment with noise across it at both ends, and shortened at both; by normal draws."""
     across, along = draws
     normal = normal_of(segment)
     unit = jnp.stack([normal[1], -normal[0]])

@@ -28,7 +28,7 @@ from sofjax.simulation.segments.detection import (
 from sofjax.simulation.segments.visibility import in_picture, length_in_image, project, unhidden
 from sofjax.simulation.world.types import NARROW, World
 
-CANDIDATES = 96  # edges of an image, the longest, whose hiding is worked out
+CANDIDATES = 96  # the longest edges of an image, for which occlusion is computed
 
 
 class Scene(eqx.Module):
@@ -66,7 +66,7 @@ class Scene(eqx.Module):
 
 def _pad(rows: np.ndarray, length: int, what: str) -> np.ndarray:
     if len(rows) > length:
-        raise ValueError(f"the world has {len(rows)} {what} where there is room for {length}")
+        raise ValueError(f"the world has {len(rows)} {what} and the capacity is {length}")
     return np.concatenate([rows, np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)])
 
 
@@ -80,13 +80,13 @@ def observe(
     detection: Detection = LSD,
     capacity: int = 64,
 ) -> Observation:
-    """What the filter takes, straight from a world; under `jax.jit`, and `jax.vmap` over drives.
+    """What the filter takes, directly from a world; under `jax.jit`, and `jax.vmap` over drives.
 
     **Arguments:**
     - `mount`, `T_world_robot`, `motion`: with one axis T in front: the mount as it shook at each
       image, true poses, and the odometer's readings.
 
-    **Returns:** an observation with a leading T and room for `capacity` segments an image, the
+    **Returns:** an observation with a leading T and `capacity` segments an image, the
     longest if there are more.
     """
 
@@ -117,8 +117,8 @@ def see(
     breadth = jax.vmap(breadth_in_image, in_axes=(0, 0, 0, None))(
         homogeneous, scene.edges_world, scene.width, P
     )
-    reach = seen_until(breadth, scene.contrast, detection.min_contrast, detection)
-    part = jax.vmap(in_picture, in_axes=(0, None, 0))(homogeneous, camera, reach)
+    depth_seen = seen_until(breadth, scene.contrast, detection.min_contrast, detection)
+    part = jax.vmap(in_picture, in_axes=(0, None, 0))(homogeneous, camera, depth_seen)
     length = jax.vmap(length_in_image)(homogeneous, part)
     candidates = min(CANDIDATES, len(scene.contrast))
     length, chosen = jax.lax.top_k(jnp.where(scene.contrast > 0, length, 0), candidates)
@@ -129,18 +129,18 @@ def see(
     part = jax.vmap(unhidden, in_axes=(0, 0, None))(plan, part, scene.walls_world - C[None, None])
     segments = jax.vmap(project)(homogeneous, part)
 
-    # As a detector reports them, each of the two edges of a fine line by a draw of its own
+    # As a detector reports them, with a separate draw for each of the two edges of a fine line
     miss_key, break_key, false_key, noise_key = jax.random.split(key, 4)
     seldom = jax.random.uniform(miss_key, (candidates, 2)) / (1 - detection.missed)
     wanted = detection.min_contrast + seldom * (detection.full_contrast - detection.min_contrast)
     wanted = jnp.where(seldom < 1, wanted, jnp.inf)
-    reach = seen_until(breadth[:, None], scene.contrast[chosen, None], wanted, detection)
+    depth_seen = seen_until(breadth[:, None], scene.contrast[chosen, None], wanted, detection)
     pieces, whole = jax.vmap(break_up, in_axes=(0, 0, None))(
         segments, jax.random.uniform(break_key, (candidates, 3)), detection.broken
     )
-    whole &= ((part[:, 1] > part[:, 0]) & (reach[:, 0] > 0))[:, None]
+    whole &= ((part[:, 1] > part[:, 0]) & (depth_seen[:, 0] > 0))[:, None]
     edges, seen = jax.vmap(both_edges, in_axes=(0, 0, 0, 0, None))(
-        homogeneous, part, breadth, reach, detection.blur
+        homogeneous, part, breadth, depth_seen, detection.blur
     )
     fine = breadth > 0
     pieces = jnp.where(fine[:, None, None, None], edges, pieces)

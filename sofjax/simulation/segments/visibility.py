@@ -8,8 +8,8 @@ from sofjax.geometry.angles import safe_divide, safe_norm
 from sofjax.geometry.camera import Camera
 
 NEAREST_DEPTH = 0.1  # metres before the camera
-WALL_DEPTH = 0.05  # metres behind a wall's face that it does not hide: what is fixed to it
-ANCHORS = (0.5, 0.2, 0.8, 0.05, 0.95)  # shares of an edge from which its seen part is grown
+WALL_DEPTH = 0.05  # metres behind a wall's face: what is fixed to it is not hidden by it
+ANCHORS = (0.5, 0.2, 0.8, 0.05, 0.95)  # shares of an edge from which its visible part is grown
 
 
 def where_positive(f: Float[Array, "2"]) -> Float[Array, "2"]:

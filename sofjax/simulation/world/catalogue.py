@@ -1,4 +1,4 @@
-"""The worlds that can be asked for by name."""
+"""The worlds that have a name."""
 
 import itertools
 
@@ -33,7 +33,7 @@ def furnish(
     floor: str,
     rng: np.random.Generator,
 ) -> World:
-    """Fit out a bare plan: `floor` is one of `FLOORS`; the rest is drawn by chance."""
+    """The furnished world of a bare plan: `floor` is one of `FLOORS`, the rest is random."""
     check_waypoints(corridors, waypoints)
     plan = Plan(corridors, union_walls(corridors), waypoints)
     tint = rng.uniform(0.94, 1.06, 3)

@@ -1,4 +1,4 @@
-"""The patterns of a corridor's floor, drawn by chance."""
+"""The patterns of a corridor's floor, at random."""
 
 from dataclasses import dataclass, field
 
@@ -71,7 +71,7 @@ def contrasting(
 
 @dataclass(frozen=True)
 class Plan:
-    """The bare corridor that is being fitted out."""
+    """The bare corridor that is furnished."""
 
     corridors: Float[np.ndarray, "n 4"]
     walls: Float[np.ndarray, "walls 2 2"]
@@ -100,12 +100,12 @@ def blocks(rng: np.random.Generator, plan: Plan, floor: np.ndarray, paint: Paint
     for i, (x0, y0, x1, y1) in enumerate(plan.corridors):
         along_x = x1 - x0 > y1 - y0
         middle, width = ((y0 + y1) / 2, y1 - y0) if along_x else ((x0 + x1) / 2, x1 - x0)
-        reach = min(0.75, 0.36 * width)
+        half = min(0.75, 0.36 * width)
         for a, b in plan.stretches(i, [j for j in range(len(plan.corridors)) if j != i]):
             start = a + rng.uniform(0.3, 0.9)
             for near in np.arange(start, b - BLOCK_WIDTH - 0.2, BLOCK_SPACING):
                 near = near + rng.normal(0, 0.006)
-                along, across = (near, near + BLOCK_WIDTH), (middle - reach, middle + reach)
+                along, across = (near, near + BLOCK_WIDTH), (middle - half, middle + half)
                 x, y = (along, across) if along_x else (across, along)
                 paint.area("mark", rectangle(x[0], y[0], x[1], y[1]), colour)
 
@@ -131,15 +131,13 @@ def grid(
     colour = contrasting(rng, floor, 0.18, 0.32, darker=bool(rng.random() < 0.8))
     width = rng.uniform(0.007, 0.012)
     centre = (plan.corridors[:, :2].min(0) + plan.corridors[:, 2:].max(0)) / 2
-    reach = (
-        np.linalg.norm(plan.corridors[:, 2:].max(0) - plan.corridors[:, :2].min(0)) / 2 + spacing
-    )
+    half = np.linalg.norm(plan.corridors[:, 2:].max(0) - plan.corridors[:, :2].min(0)) / 2 + spacing
     centre = centre + rng.uniform(0, spacing, 2)
     for turn in (angle, angle + np.pi / 2):
         d = np.array([np.cos(turn), np.sin(turn)])
         n = left_normal(d)
-        for offset in np.arange(-np.ceil(reach / spacing), reach / spacing) * spacing:
-            line = centre + offset * n + np.outer([-reach, reach], d)
+        for offset in np.arange(-np.ceil(half / spacing), half / spacing) * spacing:
+            line = centre + offset * n + np.outer([-half, half], d)
             for part in parts_inside(plan.corridors, line):
                 paint.line("grout", part, width, colour)
 

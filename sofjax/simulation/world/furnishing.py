@@ -1,4 +1,4 @@
-"""What stands beside and hangs on the walls of a corridor, drawn by chance."""
+"""Doors, boards, lamps and boxes of a corridor, at random."""
 
 import numpy as np
 
@@ -51,7 +51,7 @@ def fit_walls(
 def _places(
     rng: np.random.Generator, length: float, width: float, mean_gap: float
 ) -> list[tuple[float, float]]:
-    """Stretches of some width along a wall, apart by chance."""
+    """Stretches of some width along a wall, with random gaps between them."""
     places = []
     at = rng.uniform(0.5, 0.5 + mean_gap)
     while at + width + 0.4 < length:
@@ -61,7 +61,7 @@ def _places(
 
 
 def hang_lamps(rng: np.random.Generator, plan: Plan) -> tuple[np.ndarray, np.ndarray]:
-    """Rectangles on the ceiling along the middle of each corridor, and how each one shines."""
+    """Rectangles on the ceiling along the middle of each corridor, and the light of each."""
     lamps, spacing = [], rng.uniform(2.2, 3.4)
     for i, (x0, y0, x1, y1) in enumerate(plan.corridors):
         along_x = x1 - x0 > y1 - y0

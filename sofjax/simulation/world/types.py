@@ -1,4 +1,4 @@
-"""What a corridor is made of, and the segments that are true of it."""
+"""The parts of a corridor, and its true segments."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -143,7 +143,7 @@ class World:
         return brightness(self.look.wall)
 
 
-# Which edges of an area are edges that one sees: edge k runs from corner k to the next.
+# The visible edges of an area: edge k runs from corner k to the next.
 OUTLINE = {
     "mark": (0, 1, 2, 3),
     "threshold": (0, 2),
@@ -157,7 +157,7 @@ OUTLINE = {
 }
 
 
-NARROW = ("grout", "plank", "joint")  # kinds of lines whose truth is their middle
+NARROW = ("grout", "plank", "joint")  # kinds of lines whose true segment is their middle
 
 
 class _Found:
