@@ -21,7 +21,7 @@ def run(*arguments, **options):
 @pytest.mark.parametrize("script", STUDIES.values(), ids=STUDIES)
 def test_every_study_has_the_common_options_and_a_page(script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(script), "--help"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "path", [str(script.parent), *sys.path])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(script), run_name="__main__")
     said = capsys.readouterr().out
