@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t
 
-from sofjax import PRESETS, SlamConfig, SofSlam, StepInfo, smoothing
+from sofjax import PRESETS, SlamConfig, SofSlam, smoothing
 from sofjax.evaluation import TrajectoryErrors, evaluate_trajectory
 from sofjax.extraction import Observation
 from sofjax.geometry import SE2, Camera, Mount
@@ -31,6 +31,7 @@ from sofjax.simulation import (
     random_setup,
     simulate_run,
 )
+from sofjax.slam import StepInfo
 
 M = 64  # segments an image
 LSD = Detection()
