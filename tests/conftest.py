@@ -29,6 +29,14 @@ def pytest_configure(config: pytest.Config) -> None:
         jax.config.update(CACHED_FROM.lower(), 0.0)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """All tests of a file in one worker: what they share is made and traced once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log)
+
+
 @pytest.fixture
 def x64():
     """The laws hold to many digits; in float32 they would hide in the rounding."""
