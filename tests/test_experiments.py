@@ -69,7 +69,12 @@ def quickly():
     return dict(os.environ) if done.returncode else there
 
 
-@pytest.mark.parametrize("name", STUDIES)
+# each compiles for a minute or two: all of them with `pytest -m slow tests/test_experiments.py`
+OFTEN = "particles"
+MARKED = [pytest.param(name, marks=[pytest.mark.slow] * (name != OFTEN)) for name in STUDIES]
+
+
+@pytest.mark.parametrize("name", MARKED)
 def test_every_study_runs_quick_and_leaves_numbers_and_a_figure(name, quickly, tmp_path):
     done = run("--quick", name, "--out", tmp_path, env=quickly)
     log = tmp_path / name / "log.txt"
