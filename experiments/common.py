@@ -1,4 +1,4 @@
-"""What the experiments share: their options, drives seen as segments, batches of runs, results."""
+"""What the studies share: their options, drives seen as segments, batches of runs, results."""
 
 import argparse
 import dataclasses
@@ -16,13 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t
 
-from sofjax import PRESETS, slam
-from sofjax.evaluation import evaluate_trajectory
+from sofjax import PRESETS, SlamConfig, SofSlam, smoothing
+from sofjax.evaluation import TrajectoryErrors, evaluate_trajectory
 from sofjax.extraction import Observation
 from sofjax.geometry import SE2, Camera, Mount
 from sofjax.io.trajectory import Trajectory
 from sofjax.simulation import (
     Detection,
+    RobotSetup,
     Scene,
     World,
     make_world,
@@ -30,14 +31,15 @@ from sofjax.simulation import (
     random_setup,
     simulate_run,
 )
+from sofjax.slam import StepInfo
 
 M = 64  # segments an image
 LSD = Detection()
 
 
 def options(doc: str, file: str) -> argparse.ArgumentParser:
-    """The options that all experiments have; `file` is the script."""
-    folder = Path("runs") / Path(file).parent.name
+    """The options that all studies have; `file` is the script."""
+    folder = Path("runs") / name_of(file)
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -45,6 +47,12 @@ def options(doc: str, file: str) -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="the first of the seeds")
     parser.add_argument("--out", type=Path, default=folder, help=f"default: {folder}/")
     return parser
+
+
+def name_of(file: str) -> str:
+    """The name of a study: its script's, or its folder's if the script is `run.py`."""
+    path = Path(file)
+    return path.parent.name if path.stem == "run" else path.stem
 
 
 def save(out: Path, name: str, args: argparse.Namespace, results: dict) -> None:
@@ -63,11 +71,11 @@ def save(out: Path, name: str, args: argparse.Namespace, results: dict) -> None:
     (out / f"{name}.json").write_text(text + "\n")
 
 
-def _plain(value):
+def _plain(value: object) -> object:
     return str(value) if isinstance(value, Path) else np.asarray(value).tolist()
 
 
-def config_of(preset: str = "default", **changes: dict[str, object]) -> slam.SlamConfig:
+def config_of(preset: str = "default", **changes: dict[str, object]) -> SlamConfig:
     """A preset with some settings changed: `config_of(filter={"particles": 300})`."""
     config = PRESETS[preset]
     parts = {
@@ -86,7 +94,13 @@ class Drive(NamedTuple):
     odometry: Trajectory  # at the images
 
 
-def take_drive(world, setup, seed: int, images: int | None = None, detection=LSD) -> Drive:
+def take_drive(
+    world: World,
+    setup: RobotSetup,
+    seed: int,
+    images: int | None = None,
+    detection: Detection = LSD,
+) -> Drive:
     """Drive `setup` through `world` and see it as segments."""
     simulated = simulate_run(world, setup, seed, max_images=images)
     camera, mount = setup.camera_file.camera, setup.camera_file.mount
@@ -126,12 +140,12 @@ def stack(drives: list[Drive]) -> tuple[Camera, Mount, Observation]:
 
 
 @jax.jit
-def run_batch(config, camera, mount, observations, keys) -> slam.StepInfo:
+def run_batch(config, camera, mount, observations, keys) -> StepInfo:
     """The filter on every drive of a batch, each with its key; infos [drives, T]."""
 
     def one(camera, mount, observations, key):
-        state = SofSlam(config, camera, mount).init(key, M)
-        return SofSlam(config, camera, mount).run(state, observations)[1]
+        slam = SofSlam(config, camera, mount)
+        return slam.run(slam.init(key, M), observations)[1]
 
     return jax.vmap(one)(camera, mount, observations, keys)
 
@@ -143,12 +157,13 @@ def path_of(drive: Drive, poses: SE2) -> Trajectory:
     return Trajectory(drive.truth.stamps, xy, yaw)
 
 
-def errors_of(drive: Drive, poses: SE2):
+def errors_of(drive: Drive, poses: SE2) -> TrajectoryErrors:
     """`TrajectoryErrors` of the estimates."""
     return evaluate_trajectory(drive.truth, path_of(drive, poses))[0]
 
 
-def odometry_errors(drive: Drive):
+def odometry_errors(drive: Drive) -> TrajectoryErrors:
+    """`TrajectoryErrors` of the odometry alone."""
     return evaluate_trajectory(drive.truth, drive.odometry)[0]
 
 
@@ -174,7 +189,13 @@ def floor_of(world: World) -> str:
     return "bare"
 
 
+def path_to_smooth(info: StepInfo) -> smoothing.Path:
+    """What the smoother starts from, of the infos [T] of a whole run."""
+    return smoothing.Path(info.T_world_robot, info.jitter, info.bias[-1])
+
+
 def one_of(batch, i: int):
+    """One element of a batch."""
     return jax.tree.map(lambda leaf: leaf[i], batch)
 
 

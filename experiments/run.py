@@ -1,11 +1,13 @@
-"""All experiments, or those that are named, one after the other: whole, or quick as in CI.
+"""All studies, or those that are named, one after the other: whole, or quick as in the tests.
 
     python experiments/run.py --quick                # all of them, to see that they work
     python experiments/run.py particles corridor     # these two, whole
+    python experiments/run.py robustness             # all of one folder
     python experiments/run.py --list
 
-An experiment is a folder beside this file with a `run.py` that takes --quick, --seed and --out;
-what it says is in OUT/<name>/log.txt, and what it leaves beside that.
+A study is a script in a folder beside this file whose text names --quick; it takes --quick, --seed
+and --out. Its name is the script's, or the folder's if the script is `run.py`. What it prints is in
+OUT/<name>/log.txt, and what it writes stands beside that: <name>.json at least.
 """
 
 import argparse
@@ -18,15 +20,28 @@ from pathlib import Path
 HERE = Path(__file__).parent
 
 
-def names() -> list[str]:
-    return sorted(path.parent.name for path in HERE.glob("*/run.py"))
+def studies() -> dict[str, Path]:
+    """The script of each study, by its name."""
+    scripts = [path for path in sorted(HERE.glob("*/*.py")) if "--quick" in path.read_text()]
+    return {path.parent.name if path.stem == "run" else path.stem: path for path in scripts}
 
 
-def run(name: str, out: Path, arguments: list[str]) -> dict[str, object]:
-    """One experiment in a process of its own; it must leave its numbers as JSON."""
+def chosen(names: list[str], known: dict[str, Path]) -> list[str]:
+    """The studies of these names, all of a folder where it is named; KeyError if there is none."""
+    found = {}
+    for name in names:
+        of_folder = [study for study, path in known.items() if path.parent.name == name]
+        if not of_folder and name not in known:
+            raise KeyError(name)
+        found |= dict.fromkeys(of_folder or [name])
+    return list(found)
+
+
+def run(name: str, script: Path, out: Path, arguments: list[str]) -> dict[str, object]:
+    """One study in a process of its own; it must leave its numbers as JSON."""
     out.mkdir(parents=True, exist_ok=True)
     begun = time.time()
-    command = [sys.executable, str(HERE / name / "run.py"), "--out", str(out), *arguments]
+    command = [sys.executable, str(script), "--out", str(out), *arguments]
     with (out / "log.txt").open("w") as log:
         code = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT).returncode
     numbers = out / f"{name}.json"
@@ -48,23 +63,25 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", metavar="NAME", nargs="*", help="default: all")
+    parser.add_argument("names", metavar="NAME", nargs="*", help="studies or folders; default: all")
     parser.add_argument("--quick", action="store_true", help="each in a minute or so")
     parser.add_argument("--seed", type=int, help="the first of the seeds of each")
     parser.add_argument("--out", type=Path, default=Path("runs/experiments"), help="their folders")
     parser.add_argument("--list", action="store_true", help="the names, and nothing else")
     args = parser.parse_args()
-    known = names()
+    known = studies()
     if args.list:
         print("\n".join(known))
         return 0
-    for unknown in set(args.names) - set(known):
-        parser.error(f"there is no experiment '{unknown}'; there are {', '.join(known)}")
+    try:
+        names = chosen(args.names, known) if args.names else list(known)
+    except KeyError as error:
+        parser.error(f"there is no study '{error.args[0]}'; there are {', '.join(known)}")
     arguments = ["--quick"] * args.quick
     arguments += [] if args.seed is None else ["--seed", str(args.seed)]
     results = {}
-    for name in args.names or known:
-        results[name] = run(name, args.out / name, arguments)
+    for name in names:
+        results[name] = run(name, known[name], args.out / name, arguments)
         r = results[name]
         verdict = "passed" if r["passed"] else f"FAILED, {r['why']}; {args.out / name / 'log.txt'}"
         print(f"{name:24s} {r['seconds']:7.1f} s  {verdict}", flush=True)

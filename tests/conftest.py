@@ -16,15 +16,25 @@ from sofjax.geometry import Camera, Mount
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 CACHE = "JAX_COMPILATION_CACHE_DIR"
+CACHED_FROM = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"  # 1 by default, and most are shorter
 
 
-def pytest_configure(config):
+def pytest_configure(config: pytest.Config) -> None:
     """All workers, and all that they start, compile a program once and read it after that."""
     if CACHE not in os.environ:
-        folder = tempfile.TemporaryDirectory(prefix="sofjax-tests-")
+        folder = tempfile.TemporaryDirectory(prefix="sofjax-tests-", ignore_cleanup_errors=True)
         config.add_cleanup(folder.cleanup)
-        os.environ[CACHE] = folder.name
+        os.environ |= {CACHE: folder.name, CACHED_FROM: "0"}
         jax.config.update(CACHE.lower(), folder.name)
+        jax.config.update(CACHED_FROM.lower(), 0.0)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """All tests of a file in one worker: what they share is made and traced once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The experiments run: each by the one command, quick."""
+"""The studies run: each by the one command, quick."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
-SCRIPTS = sorted(EXPERIMENTS.glob("*/run.py"))
+STUDIES = runpy.run_path(str(EXPERIMENTS / "run.py"))["studies"]()
 
 
 def run(*arguments, **options):
@@ -18,10 +18,10 @@ def run(*arguments, **options):
     return subprocess.run(command, capture_output=True, text=True, **options)
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.parent.name)
-def test_every_experiment_has_the_common_options_and_a_page(script, monkeypatch, capsys):
+@pytest.mark.parametrize("script", STUDIES.values(), ids=STUDIES)
+def test_every_study_has_the_common_options_and_a_page(script, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(script), "--help"])
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "path", [str(script.parent), *sys.path])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(script), run_name="__main__")
     said = capsys.readouterr().out
@@ -49,14 +49,14 @@ def test_the_one_command_tells_what_failed(tmp_path):
     }
     for name, code in wrong.items():
         (tmp_path / name).mkdir()
-        (tmp_path / name / "run.py").write_text(code)
+        (tmp_path / name / "run.py").write_text(f"# takes --quick\n{code}")
     command = [sys.executable, str(tmp_path / "run.py"), "--out", str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1 and "0 of 3 passed" in done.stdout
     for words in ("ValueError: three legs", "left no forgets.json", "garbles.json is no JSON"):
         assert words in done.stdout
     unknown = subprocess.run([*command, "walks"], capture_output=True, text=True)
-    assert unknown.returncode == 2 and "no experiment 'walks'" in unknown.stderr
+    assert unknown.returncode == 2 and "no study 'walks'" in unknown.stderr
 
 
 @pytest.fixture(scope="session")
@@ -69,9 +69,13 @@ def quickly():
     return dict(os.environ) if done.returncode else there
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.parent.name)
-def test_every_experiment_runs_quick_and_leaves_numbers_and_a_figure(script, quickly, tmp_path):
-    name = script.parent.name
+# each compiles for a minute or two: all of them with `pytest -m slow tests/test_experiments.py`
+OFTEN = "particles"
+MARKED = [pytest.param(name, marks=[pytest.mark.slow] * (name != OFTEN)) for name in STUDIES]
+
+
+@pytest.mark.parametrize("name", MARKED)
+def test_every_study_runs_quick_and_leaves_numbers_and_a_figure(name, quickly, tmp_path):
     done = run("--quick", name, "--out", tmp_path, env=quickly)
     log = tmp_path / name / "log.txt"
     assert done.returncode == 0, done.stdout + done.stderr + log.read_text()[-2000:]

@@ -22,7 +22,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import slam
+from sofjax import SlamConfig
 from sofjax.io.drive import read_drive
 from sofjax.simulation import make_world, random_setup, record, simulate_run
 from sofjax.vision import Frontend, FrontendSettings, observe_drive
@@ -65,7 +65,7 @@ DEFAULT, LEVER, HOUGH = "defaults", "lever arm ignored", "Hough"
 QUICK = ("gamma rule, eq. (14)", "Theta = 3", LEVER)
 
 
-def config_of(variant: str) -> slam.SlamConfig:
+def config_of(variant: str) -> SlamConfig:
     config = common.config_of(filter={"particles": PARTICLES})
     for part, given in VARIANTS.get(variant, {}).items():
         config = dataclasses.replace(

@@ -18,7 +18,7 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1]))
 import common
-from mount_logs import EXACT, EXACT_MODEL, cramer_rao, make_log, roughly
+from logs import EXACT, EXACT_MODEL, cramer_rao, make_log, roughly
 
 from sofjax.calibration import TURNS, DriveFitConfig, FitConfig, PairNoise, TrackConfig, fit_drive
 from sofjax.simulation import Odometer, around, furnish, make_world

@@ -16,7 +16,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import slam
+from sofjax import SofSlam
 
 WORLDS = ("paper", "l", "random")
 SIZES = (10, 30, 100, 300, 1000, 3000, 10_000, 30_000, 100_000)
@@ -30,10 +30,9 @@ def run_size(N: int, drives: dict[str, common.Drive]) -> dict[str, object]:
     errors, cpu, wall, images = {}, 0.0, 0.0, 0
     for name, drive in drives.items():
         camera, mount, log = common.one_of(common.stack([drive]), 0)
-        start = SofSlam(config, camera, mount).init(jax.random.key(7), common.M)
-        call = lambda s=start, a=(camera, mount), log=log: jax.block_until_ready(
-            slam.run(config, *a, s, log)
-        )
+        slam = SofSlam(config, camera, mount)
+        start = slam.init(jax.random.key(7), common.M)
+        call = lambda slam=slam, s=start, log=log: jax.block_until_ready(slam.run(s, log))
         if not errors:
             call()  # compiles
         c, w = time.process_time(), time.perf_counter()

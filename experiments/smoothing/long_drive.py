@@ -1,6 +1,6 @@
 """A long drive, every corridor of it twice: what does it cost to run and to smooth?
 
-    python experiments/long_drive/run.py [--quick] [--rings 16] [--seed S] [--out DIR]
+    python experiments/smoothing/long_drive.py [--quick] [--rings 16] [--seed S] [--out DIR]
 
 Rings of corridors beside each other, each driven twice before the next, over dark blocks every
 2.3 m, seen as segments. long_drive.json has the seconds, the peak of the memory and the errors;
@@ -19,7 +19,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import smoothing
+from sofjax import SofSlam, smoothing
 from sofjax.evaluation import evaluate_trajectory
 from sofjax.simulation import around, furnish, random_setup
 
@@ -73,8 +73,9 @@ def main() -> None:
     told["driven_s"] = float(np.ptp(drive.truth.stamps))
 
     begun = time.perf_counter()
-    start = SofSlam(config, camera, mount).init(jax.random.key(args.seed), common.M)
-    state, info = jax.block_until_ready(SofSlam(config, camera, mount).run(start, log))
+    slam = SofSlam(config, camera, mount)
+    start = slam.init(jax.random.key(args.seed), common.M)
+    state, info = jax.block_until_ready(slam.run(start, log))
     log, info = jax.tree.map(lambda a: np.asarray(a)[: told["images"]], (log, info))
     segment_map = jax.device_get(state.segment_map)
     told["seconds"]["filter"] = time.perf_counter() - begun
@@ -83,7 +84,7 @@ def main() -> None:
     del start, state
     jax.clear_caches()
     begun, cpu = time.perf_counter(), time.process_time()
-    path = smoothing.Path(info.T_world_robot, info.tilt, info.bias[-1])
+    path = common.path_to_smooth(info)
     done = smoothing.smooth(config, camera, mount, log, path, segment_map)
     told["seconds"]["smoothing"] = time.perf_counter() - begun
     told["seconds"]["smoothing_cpu"] = time.process_time() - cpu

@@ -1,6 +1,6 @@
 """Which residual fits the mount best: rho and theta of eq. (9), or distances of the end points?
 
-    python experiments/mount_residuals/run.py [--quick] [--logs 200] [--seed FIRST] [--out DIR]
+    python experiments/calibration/residuals.py [--quick] [--logs 200] [--seed FIRST] [--out DIR]
 
 Logs of floor segments with 0.5 px noise from the simulator: random rigs in random worlds, exact
 odometry, no vibration. Tracks and pairs are the same for all residuals, and so is the solver.
@@ -18,7 +18,7 @@ import optimistix as optx
 
 sys.path.append(str(Path(__file__).parents[1]))
 import common
-from mount_logs import EXACT_MODEL, cramer_rao, make_log, roughly
+from logs import EXACT_MODEL, cramer_rao, make_log, roughly
 
 from sofjax.calibration import (
     PairNoise,
@@ -146,10 +146,8 @@ def main() -> None:
         print(f"| {name} | {row['height_mm']:.1f} mm | {row['pitch_mrad']:.2f} mrad | "
               f"{row['roll_mrad']:.2f} mrad | {times} | {inside} |")  # fmt: skip
     pairs = [d[2] for d in done]
-    common.save(
-        args.out, "mount_residuals", args, {"logs": len(done), "pairs": pairs, "fits": table}
-    )
-    draw(table, args.out / "mount_residuals.png")
+    common.save(args.out, "residuals", args, {"logs": len(done), "pairs": pairs, "fits": table})
+    draw(table, args.out / "residuals.png")
 
 
 def draw(table: dict, path: Path) -> None:

@@ -1,6 +1,6 @@
 """Fifty loops over blocks every 2.3 m, and fifty drives that never come back: are loops told?
 
-    python experiments/loops/run.py [--quick] [--drives 50] [--seed S] [--out DIR]
+    python experiments/smoothing/loops.py [--quick] [--drives 50] [--seed S] [--out DIR]
 
 Each seed has a ring of corridors, its begin driven again in the end, or a way of as many bends
 that does not come back, over a floor that repeats; and a robot of its own. The filter runs at the
@@ -20,7 +20,7 @@ from scipy.stats import chi2
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import loop_closure, smoothing
+from sofjax import SofSlam, loop_closure
 from sofjax.evaluation import evaluate_trajectory
 from sofjax.geometry import SE2
 from sofjax.io.trajectory import Trajectory
@@ -58,11 +58,11 @@ def drive_one(kind: str, seed: int, size: float) -> dict[str, object]:
     drive = common.take_drive(world, random_setup(seed), seed)
     camera, mount, log = common.one_of(common.stack([drive]), 0)
     T, config = len(drive.truth.stamps), common.config_of()
-    start = SofSlam(config, camera, mount).init(jax.random.key(seed), common.M)
-    state, info = SofSlam(config, camera, mount).run(start, log)
+    slam = SofSlam(config, camera, mount)
+    state, info = slam.run(slam.init(jax.random.key(seed), common.M), log)
     log, info = jax.tree.map(lambda leaf: np.asarray(leaf)[:T], (log, info))
     begun = time.perf_counter()
-    path = smoothing.Path(info.T_world_robot, info.tilt, info.bias[-1])
+    path = common.path_to_smooth(info)
     done = loop_closure.close(config, camera, mount, log, path, state.segment_map)
     seconds = time.perf_counter() - begun
     online = evaluate_trajectory(drive.truth, common.path_of(drive, info.T_world_robot))[0]

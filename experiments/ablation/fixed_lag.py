@@ -1,10 +1,10 @@
 """What is smoothing the last keyframes while driving worth, over whole drives?
 
-    python experiments/window/run.py [--quick] [--drives 60] [--seed S] [--out DIR]
+    python experiments/ablation/fixed_lag.py [--quick] [--drives 60] [--seed S] [--out DIR]
 
 Random worlds and robots seen as segments, driven whole by the filter alone and with windows of
 several sizes, with the same seed; the ratios of the errors are taken in pairs. What OUT/runs.json
-holds already is not run again. Writes window.json and window.png.
+holds already is not run again. Writes fixed_lag.json and fixed_lag.png.
 """
 
 import json
@@ -18,6 +18,8 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
+from sofjax import SofSlam
+
 SIZES = (0, 8, 12)  # keyframes; 0: none are smoothed
 
 
@@ -29,10 +31,9 @@ def run_drive(seed: int, sizes: tuple[int, ...], images: int | None) -> dict[str
     log = jax.tree.map(room, drive.observations)  # few lengths to compile for
     for size in sizes:
         config = common.config_of(window={"keyframes": size})
-        state = SofSlam(config, drive.camera, drive.mount).init(jax.random.key(seed), common.M)
-        call = lambda c=config, s=state: jax.block_until_ready(
-            SofSlam(c, drive.camera, drive.mount).run(s, log)
-        )
+        slam = SofSlam(config, drive.camera, drive.mount)
+        state = slam.init(jax.random.key(seed), common.M)
+        call = lambda slam=slam, state=state: jax.block_until_ready(slam.run(state, log))
         begun, before = time.process_time(), SofSlam.run._cache_size()
         _, info = call()
         if SofSlam.run._cache_size() > before:  # it was compiled
@@ -87,7 +88,7 @@ def main() -> None:
             told = ", ".join(f"{k}: {v['ate_m']:.4f} m" for k, v in runs[str(seed)].items())
             print(f"drive {seed}: {told}", flush=True)
     table = table_of(runs)
-    common.save(args.out, "window", args, {"table": table})
+    common.save(args.out, "fixed_lag", args, {"table": table})
     print("\n| keyframes | ATE m: 50, 90, 100 % | ratio (95 %) | yaw ° | ratio (95 %) | CPU ms |")
     print("|" + "---|" * 6)
     for size, row in table.items():
@@ -97,7 +98,7 @@ def main() -> None:
             parts.append("{:.2f} ({:.2f} to {:.2f})".format(
                 row[key]["ratio"], *row[key]["interval"]))  # fmt: skip
         print(f"| {size} | {' | '.join(parts)} | {row['cpu_ms']:.2f} |")
-    draw(runs, args.out / "window.png")
+    draw(runs, args.out / "fixed_lag.png")
 
 
 if __name__ == "__main__":

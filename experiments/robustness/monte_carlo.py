@@ -1,6 +1,6 @@
 """A hundred seeds of three worlds: how large is the error, and does the filter know it?
 
-    python experiments/monte_carlo/run.py [--quick] [--seeds 100] [--images 250] [--out DIR]
+    python experiments/robustness/monte_carlo.py [--quick] [--seeds 100] [--images 250] [--out DIR]
 
 Each seed has a robot of its own, in a world furnished by the seed, seen as segments; all runs
 are at the default settings, in vmapped batches. Writes monte_carlo.json and .png, and keeps each

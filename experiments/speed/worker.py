@@ -1,6 +1,6 @@
 """One process of a filter whose particles are shared by jax.distributed; started by run.py.
 
-python experiments/scaling/worker.py --rank R --processes P --address HOST:PORT
+python experiments/speed/worker.py --rank R --processes P --address HOST:PORT
 """
 
 import argparse
@@ -30,7 +30,8 @@ def main() -> None:
         jax.distributed.initialize(args.address, args.processes, args.rank)
     import common  # makes arrays, which must wait for the line above
 
-    from sofjax import slam
+    from sofjax import SofSlam
+    from sofjax.slam import shard
 
     # the same in every process: a drive seen as segments, and the first state
     drive = common.random_drive("random", args.seed, args.images)
@@ -41,11 +42,12 @@ def main() -> None:
     auto = (jax.sharding.AxisType.Auto,)
     mesh = jax.make_mesh((jax.device_count(),), ("particles",), axis_types=auto)
     copied = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-    state = slam.shard(state, mesh)
+    state = shard(state, mesh)
     camera, mount, log = jax.jit(lambda a: a, out_shardings=copied)((camera, mount, log))
-    jax.block_until_ready(SofSlam(config, camera, mount).run(state, log))  # compiled
+    slam = SofSlam(config, camera, mount)
+    jax.block_until_ready(slam.run(state, log))  # compiled
     begun = time.perf_counter()
-    state, info = jax.block_until_ready(SofSlam(config, camera, mount).run(state, log))
+    state, info = jax.block_until_ready(slam.run(state, log))
     seconds = time.perf_counter() - begun
     if args.rank == 0:
         held = [shard.data.shape[0] for shard in state.particles.log_weight.addressable_shards]

@@ -1,6 +1,6 @@
 """What a step costs, by particles, segments of an image, slots of the map, runs, and processes.
 
-    python experiments/scaling/run.py [--quick] [--images 20] [--only runs] [--out DIR]
+    python experiments/speed/step.py [--quick] [--images 20] [--only runs] [--out DIR]
 
 One stretch of a drive is run with one size changed at a time; compiling is told apart. Then 64
 runs of 256 particles over 300 images, by `many_runs.py`, one call after the other and all in one
@@ -36,6 +36,7 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
     import jax
     import jax.numpy as jnp
 
+    from sofjax import SofSlam
     from sofjax.geometry import Segments
 
     drive = common.random_drive("random", seed, images)
@@ -45,12 +46,12 @@ def measure(seed: int, images: int, particles: int, segments: int, map: int) -> 
     repeated = Segments(seen.endpoints[:, fill], seen.valid[:, fill])
     observations = type(observations)(repeated, observations.motion, observations.overflow)
     config = common.config_of(filter={"particles": particles}, segment_map={"capacity": map})
-    camera, mount = drive.camera, drive.mount
-    state = SofSlam(config, camera, mount).init(jax.random.key(seed), segments)
+    slam = SofSlam(config, drive.camera, drive.mount)
+    state = slam.init(jax.random.key(seed), segments)
     begun = time.process_time()
-    compiled = SofSlam.run.lower(config, camera, mount, state, observations).compile()
+    compiled = SofSlam.run.lower(slam, state, observations).compile()
     compiling = time.process_time() - begun
-    call = lambda: jax.block_until_ready(compiled(config, camera, mount, state, observations))
+    call = lambda: jax.block_until_ready(compiled(slam, state, observations))
     call()
     cpu, wall = [], []
     for _ in range(3):
@@ -136,9 +137,9 @@ def main():
     args.images = 10 if args.quick else args.images
     parts = {"steps": steps, "runs": runs_of, "processes": processes_of}
     told = {name: part(args) for name, part in parts.items() if args.only in (None, name)}
-    common.save(args.out, "scaling", args, told)
+    common.save(args.out, "step", args, told)
     if "steps" in told:
-        draw(told["steps"], args.out / "scaling.png")
+        draw(told["steps"], args.out / "step.png")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Thirty metres straight on, with lines across the way and without: what holds the distance?
 
-    python experiments/corridor/run.py [--quick] [--seeds 20] [--out DIR]
+    python experiments/robustness/corridor.py [--quick] [--seeds 20] [--out DIR]
 
 One corridor, border stripes and baseboards along it; across the way bars as wide as the paper's
 blocks, or joints of 2 cm, every two to three metres, or nothing. Each seed has a robot of its own,

@@ -1,6 +1,6 @@
 """A hundred random worlds, each driven once and run at the default settings of `sofjax run`.
 
-    python experiments/random_worlds/run.py [--worlds N] [--seed FIRST] [--set name=value ...]
+    python experiments/robustness/random_worlds.py [--quick] [--worlds N] [--set name=value ...]
 
 World, robot, camera and odometer are those of `sofjax simulate --world random --seed S`. Worlds
 that OUT/results.csv holds already are skipped, so an interrupted run goes on where it was; the

@@ -1,6 +1,6 @@
 """Many runs in one call against one call after the other; JSON on the standard output.
 
-python experiments/scaling/many_runs.py [--runs 64] [--images 300] [--rounds 3] [--seed S]
+python experiments/speed/many_runs.py [--runs 64] [--images 300] [--rounds 3] [--seed S]
 """
 
 import argparse
@@ -21,6 +21,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
+from sofjax import SofSlam
 from sofjax.extraction import Observation
 
 TOGETHER = 16  # runs side by side on a core: what they work on then fits into its cache
@@ -38,8 +39,8 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
     """Seconds of one call for many seeds of the filter, and of a call for each, alternating.
 
     Every core is a device of its own: runs have nothing to tell each other, so that each device
-    takes its share of them. The calls one by one are those of the front page, `slam.init` and
-    `slam.run`: one device, which is free to use all cores.
+    takes its share of them. The calls one by one are those of the README, `SofSlam.init`
+    and `SofSlam.run`: one device, which may use all cores.
     """
     drive = common.random_drive("random", seed, images)
     log = trimmed(drive.observations)
@@ -48,8 +49,8 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
     keys = jax.random.split(jax.random.key(seed), runs)
 
     def run(log, key):
-        state = SofSlam(config, drive.camera, drive.mount).init(key, M)
-        return SofSlam(config, drive.camera, drive.mount).run(state, log)[1]
+        slam = SofSlam(config, drive.camera, drive.mount)
+        return slam.run(slam.init(key, M), log)[1]
 
     def share(log, keys):
         return jax.lax.map(lambda key: run(log, key), keys, batch_size=TOGETHER)
