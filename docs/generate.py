@@ -1,10 +1,11 @@
-"""The pages that are made of the code: `settings.md` of the fields, `api.md` of the docstrings."""
+"""The pages that are made: of the settings' fields, of the docstrings, and of the index of studies."""
 
 import ast
 import dataclasses
 import importlib
 import inspect
 import io
+import re
 import textwrap
 import tokenize
 from pathlib import Path
@@ -45,10 +46,17 @@ SETTINGS = {  # of a run, by the first part of their names
 
 def write(folder: Path) -> None:
     """Write both pages into a folder, if they have changed."""
-    for name, text in (("settings.md", settings_page()), ("api.md", api_page())):
+    pages = {"settings.md": settings_page(), "api.md": api_page(), "studies.md": studies_page()}
+    for name, text in pages.items():
         file = folder / name
         if not file.exists() or file.read_text() != text:
             file.write_text(text)
+
+
+def studies_page() -> str:
+    """The index of `experiments/`, without its links to the pages beside it."""
+    index = Path(__file__).parents[1] / "experiments" / "README.md"
+    return re.sub(r"\[`(\w+/)`\]\([^)]*\)", r"`experiments/\1`", index.read_text())
 
 
 def settings_page() -> str:

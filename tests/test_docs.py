@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = {
     page.stem: page.read_text()
     for page in sorted((ROOT / "docs").glob("*.md"))
-    if page.stem not in ("api", "settings")  # made of the code
+    if page.stem not in ("api", "settings", "studies")  # made of the code
 }
 COSTLY = ("calibrate",)
 
@@ -79,7 +79,7 @@ def test_the_page_of_settings_has_all_that_a_run_lists():
 
 def test_what_the_pages_link_to_is_there():
     made = generated()
-    files = {"api.md": made.api_page(), "settings.md": made.settings_page()}
+    files = {"api.md": made.api_page(), "settings.md": made.settings_page(), "studies.md": ""}
     files |= {f"{name}.md": text for name, text in PAGES.items()}
     slug = lambda title: re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-").replace("_", "-")
     for name, text in PAGES.items():

@@ -11,10 +11,10 @@ from sofjax.particles import (
     Particles,
     effective_size,
     mean_pose,
+    most_likely,
     pose_covariance,
     resample_observable,
     systematic,
-    winner,
 )
 
 KEYS = [jax.random.key(i) for i in range(20)]
@@ -105,8 +105,8 @@ def test_one_particle_with_everything_is_the_only_parent():
 
 
 def test_the_winner_takes_all():
-    np.testing.assert_array_equal(winner(log(1, 5, 3)), [1, 1, 1])
-    np.testing.assert_array_equal(winner(log(1, 1)), [0, 0])
+    np.testing.assert_array_equal(most_likely(log(1, 5, 3)), [1, 1, 1])
+    np.testing.assert_array_equal(most_likely(log(1, 1)), [0, 0])
 
 
 def test_the_chosen_have_equal_weights_and_keep_their_pose_and_bias():
