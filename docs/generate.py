@@ -1,4 +1,4 @@
-"""The pages that are made: of the settings' fields, of the docstrings, and of the index of studies."""
+"""The pages that are made: of the fields of settings, of docstrings, of the index of studies."""
 
 import ast
 import dataclasses
