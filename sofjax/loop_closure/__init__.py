@@ -1,4 +1,4 @@
-"""A place seen again: found by the constellation of its lines, and the drive closed there.
+"""A place seen again: recognised by the geometry of its lines, and the loop closed there.
 
 `close` smooths a drive, and again with each loop that it finds. `find` looks for the lines of the
 last metres among those of long ago, for every pose that the uncertainty allows; `distribute` is the
@@ -12,8 +12,8 @@ from sofjax.loop_closure.place_recognition import Closing as Closing
 from sofjax.loop_closure.place_recognition import ClosingConfig as ClosingConfig
 from sofjax.loop_closure.place_recognition import find as find
 from sofjax.loop_closure.revisits import AGO as AGO
-from sofjax.loop_closure.revisits import Drive as Drive
 from sofjax.loop_closure.revisits import Revisit as Revisit
+from sofjax.loop_closure.revisits import TimedLines as TimedLines
 from sofjax.loop_closure.revisits import closed as closed
 from sofjax.loop_closure.revisits import driven as driven
 from sofjax.loop_closure.revisits import joined_map as joined_map

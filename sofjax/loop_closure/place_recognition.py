@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sofjax._checks import check_fields
 from sofjax.geometry.angles import wrap_axial
 from sofjax.geometry.lines import normal, polar_through
 from sofjax.geometry.se2 import SE2
@@ -17,7 +18,7 @@ from sofjax.geometry.segments import overlap
 
 
 class ClosingConfig(eqx.Module):
-    """When two constellations are one place."""
+    """When two sets of lines are one place."""
 
     sigma: float = 0.03  # metres between two descriptions of one line ...
     angle: float = 0.02  # ... and radians
@@ -30,6 +31,14 @@ class ClosingConfig(eqx.Module):
     share: float = 0.7  # of the lines that should fit
     margin: float = 15.0  # log-likelihood by which the best place must lead all others ...
     apart: float = 0.3  # ... which are this far away, metres
+
+    def __check_init__(self) -> None:
+        check_fields(
+            self,
+            whole_from={"most": 1, "matched": 1},
+            positive=("sigma", "angle", "e_max", "reach", "step", "turn"),
+            at_least_zero=("share", "margin", "apart"),
+        )
 
 
 class Closing(eqx.Module):
@@ -45,12 +54,12 @@ class Closing(eqx.Module):
 
 
 def hypotheses(
-    rules: ClosingConfig, sigma: Float[np.ndarray, "3"]
+    config: ClosingConfig, sigma: Float[np.ndarray, "3"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Shifts and turns (x, y, yaw) [H, 3] that the standard deviations allow, and their spacing."""
-    half = rules.reach * np.asarray(sigma)
-    step = np.array([rules.step, rules.step, rules.turn])
-    while np.prod(2 * np.ceil(half / step) + 1) > rules.most:
+    half = config.reach * np.asarray(sigma)
+    step = np.array([config.step, config.step, config.turn])
+    while np.prod(2 * np.ceil(half / step) + 1) > config.most:
         step = step * 1.15
     axes = [
         s * np.arange(-np.ceil(h / s), np.ceil(h / s) + 1) for h, s in zip(half, step, strict=True)
@@ -60,7 +69,7 @@ def hypotheses(
 
 @jax.jit
 def score(
-    rules: ClosingConfig,
+    config: ClosingConfig,
     later: Float[Array, "L 2 2"],
     used: Bool[Array, "L"],
     earlier: Float[Array, "E 2 2"],
@@ -81,8 +90,8 @@ def score(
     line = jax.vmap(polar_through)(earlier)
     n = normal(line)
     length = jnp.linalg.norm(later[:, 1] - later[:, 0], axis=1)
-    across = rules.sigma**2 + (slack[0] / 2) ** 2
-    along = rules.angle**2 + (slack[2] / 2) ** 2
+    across = config.sigma**2 + (slack[0] / 2) ** 2
+    along = config.angle**2 + (slack[2] / 2) ** 2
 
     def of_move(move: Array) -> tuple[Array, ...]:
         moved = SE2(move[:2], move[2]).apply(later)
@@ -93,18 +102,18 @@ def score(
         e = off**2 / across + turn**2 / along
         shared = jax.vmap(jax.vmap(overlap, in_axes=(0, None)), in_axes=(None, 0))(earlier, moved)
         e = jnp.where(there & (shared > 0.3 * length[:, None]), e, jnp.inf)
-        best = jnp.minimum(e.min(axis=1), rules.e_max)
+        best = jnp.minimum(e.min(axis=1), config.e_max)
         return (
             -0.5 * jnp.sum(jnp.where(used, best, 0)),
             e.argmin(axis=1),
-            used & (best < rules.e_max),
+            used & (best < config.e_max),
         )
 
     return jax.lax.map(of_move, moves, batch_size=256)
 
 
 def find(
-    rules: ClosingConfig,
+    config: ClosingConfig,
     later: np.ndarray,
     earlier: np.ndarray,
     sigma: np.ndarray,
@@ -119,31 +128,31 @@ def find(
     none = lambda reason, matched=0, lead=0.0: Closing(
         SE2.identity(), False, reason, matched, len(later), lead, np.zeros((0, 2), int)
     )  # fmt: skip
-    if len(later) < rules.matched or len(earlier) < rules.matched:
+    if len(later) < config.matched or len(earlier) < config.matched:
         return none("too few lines")
     middle = later.mean(axis=(0, 1))
     a, used = _pad(later - middle)
     b, there = _pad(earlier - middle)
     ask = lambda moves, step: [
         np.asarray(v)[: len(moves)]
-        for v in score(rules, a, used, b, there, _pad_rows(moves), jnp.asarray(step, a.dtype))
+        for v in score(config, a, used, b, there, _pad_rows(moves), jnp.asarray(step, a.dtype))
     ]
-    moves, step = hypotheses(rules, sigma)
+    moves, step = hypotheses(config, sigma)
     value, _, _ = ask(moves, step)
 
-    def refined(move: Array) -> tuple[Array, ...]:
+    def refined(move: np.ndarray) -> tuple[np.ndarray, ...]:
         """The best move about one, to a sixteenth of the spacing; and what `score` says of it."""
         for spacing in (step / 4, step / 16):
             ticks = [s * np.arange(-4, 5) for s in spacing]
             around = move + np.stack(np.meshgrid(*ticks, indexing="ij"), -1).reshape(-1, 3)
-            told = ask(around, spacing)
-            top = told[0].argmax()
+            scores = ask(around, spacing)
+            top = scores[0].argmax()
             move = around[top]
-        return move, *(a[top] for a in told)
+        return move, *(a[top] for a in scores)
 
     best, value_best, nearest, fits = refined(moves[value.argmax()])
     matched = int(fits.sum())
-    away = (np.hypot(*(moves[:, :2] - best[:2]).T) > rules.apart) | (
+    away = (np.hypot(*(moves[:, :2] - best[:2]).T) > config.apart) | (
         np.abs(moves[:, 2] - best[2]) > 0.1
     )
     rival = moves[away][value[away].argmax()] if away.any() else None
@@ -152,13 +161,13 @@ def find(
         lead = float(value_best - refined(rival)[1])
     angles = np.arctan2(*(later[:, 1] - later[:, 0]).T[::-1])[fits[: len(later)]]
     spread = 1 - np.abs(np.exp(2j * angles).mean()) if matched else 0.0
-    if matched < rules.matched or matched < rules.share * len(later):
+    if matched < config.matched or matched < config.share * len(later):
         return none("too few of the lines fit", matched, lead)
     if spread < 0.1:
         return none("all lines that fit run one way", matched, lead)
-    if lead < rules.margin:
+    if lead < config.margin:
         return none("another place fits nearly as well", matched, lead)
-    if (np.abs(best[:2]) > 0.95 * rules.reach * sigma[:2]).any():
+    if (np.abs(best[:2]) > 0.95 * config.reach * sigma[:2]).any():
         return none("at the edge of what was searched", matched, lead)
     about = SE2(jnp.asarray(middle), jnp.zeros(()))
     T = about @ SE2(jnp.asarray(best[:2]), jnp.asarray(best[2])) @ about.inverse()

@@ -14,13 +14,13 @@ from sofjax.loop_closure.place_recognition import Closing, ClosingConfig, find
 from sofjax.segment_map import FinalMap, SegmentMap
 from sofjax.smoothing import Path, Smoothed
 
-WINDOW = 6.0  # metres of the way whose new lines are looked for together
-AGO = 10.0  # metres of the way after which a place seen again is a loop
+WINDOW = 6.0  # metres of path whose new lines are matched together
+AGO = 10.0  # metres of path after which a revisit is a loop
 NEAR = 5.0  # metres about the later lines in which earlier ones count
-EVERY = 2.0  # metres between the places of the way that are asked
+EVERY = 2.0  # metres of path between the images that are asked
 
 
-class Drive(eqx.Module):
+class TimedLines(eqx.Module):
     """A path, and lines that know when they were seen. Arrays on the host."""
 
     T_world_robot: SE2  # [T]
@@ -35,8 +35,8 @@ class Drive(eqx.Module):
         return np.append(0.0, np.cumsum(np.hypot(*steps.T)))
 
 
-def driven(path: Path, mount: Mount, segment_map: SegmentMap, final: FinalMap) -> Drive:
-    """As the filter left it: of its drift no more is known than that it grows with the way."""
+def driven(path: Path, mount: Mount, segment_map: SegmentMap, final: FinalMap) -> TimedLines:
+    """The path and lines of the filter; its drift is only known to grow with the distance."""
     T = jax.tree.map(lambda a: np.asarray(a, float), path.T_world_robot)
     nadirs = np.asarray(
         jax.jit(lambda T, xy: T.apply(xy))(path.T_world_robot, mount.T_robot_nadir.xy)
@@ -47,13 +47,15 @@ def driven(path: Path, mount: Mount, segment_map: SegmentMap, final: FinalMap) -
     use = np.asarray(final.is_floor)
     last = np.where(use, len(T.yaw) - 1 - np.asarray(segment_map.unseen), -1)
     ends = np.asarray(final.endpoints_world, float)
-    drive = Drive(path.T_world_robot, np.zeros((len(T.yaw), 3)), ends, off.argmin(axis=1), last)
+    drive = TimedLines(
+        path.T_world_robot, np.zeros((len(T.yaw), 3)), ends, off.argmin(axis=1), last
+    )
     way = drive.travelled[:, None]
     return eqx.tree_at(lambda d: d.sigma, drive, way * [0.005, 0.005, 0] + [0.05, 0.05, 0.02])
 
 
-def solved(smoothed: Smoothed, final: FinalMap) -> Drive:
-    """As the smoother left it, with the covariances that it found."""
+def solved(smoothed: Smoothed, final: FinalMap) -> TimedLines:
+    """The path and lines of the smoother, with its covariances."""
     frames, index = smoothed.problem.keyframes, smoothed.index
     n, K = len(index), len(final.is_floor)
     frame, slot = np.nonzero(frames.known[:n])
@@ -65,7 +67,7 @@ def solved(smoothed: Smoothed, final: FinalMap) -> Drive:
     at = np.clip(np.searchsorted(index, np.arange(len(smoothed.T_world_robot.yaw))), 0, n - 1)
     sigma = np.sqrt(np.einsum("nii->ni", smoothed.solution.pose_covariance)[:n, :3])[at]
     last = np.where(final.is_floor, last, -1)
-    return Drive(
+    return TimedLines(
         smoothed.T_world_robot, np.maximum(sigma, [0.05, 0.05, 0.01]),
         np.asarray(final.endpoints_world), first, last,
     )  # fmt: skip
@@ -80,10 +82,12 @@ class Revisit(eqx.Module):
     lines: np.ndarray  # [P, 2] lines of the drive that are one: the later, the earlier
 
 
-def revisits(rules: ClosingConfig, drive: Drive, images: np.ndarray | None = None) -> list[Revisit]:
+def revisits(
+    config: ClosingConfig, drive: TimedLines, images: np.ndarray | None = None
+) -> list[Revisit]:
     """Ask at each of some images, by default every few metres, whether the place was seen before.
 
-    Lines that were seen both long ago and lately were found again already and ask for nothing.
+    Lines that were seen both long ago and lately have been re-observed: they need no closing.
     """
     way = drive.travelled
     if images is None:
@@ -96,14 +100,14 @@ def revisits(rules: ClosingConfig, drive: Drive, images: np.ndarray | None = Non
         new = alive & (way[drive.first] > way[image] - WINDOW) & (drive.first <= image)
         if not new.any():
             continue
-        reach = NEAR + rules.reach * drive.sigma[image, :2].max()
+        reach = NEAR + config.reach * drive.sigma[image, :2].max()
         near = np.hypot(*(middle - middle[new].mean(axis=0)).T) < reach
         old = alive & near & (way[drive.last] < way[image] - AGO)
-        if min(new.sum(), old.sum()) < rules.matched:
+        if min(new.sum(), old.sum()) < config.matched:
             continue
         i, j = np.flatnonzero(new), np.flatnonzero(old)
         closing = find(
-            rules, drive.endpoints_world[i], drive.endpoints_world[j], drive.sigma[image]
+            config, drive.endpoints_world[i], drive.endpoints_world[j], drive.sigma[image]
         )
         pairs = np.stack([i[closing.pairs[:, 0]], j[closing.pairs[:, 1]]], axis=1)
         since = drive.first[pairs[:, 1]].mean() if len(pairs) else drive.first[j].mean()
@@ -111,8 +115,8 @@ def revisits(rules: ClosingConfig, drive: Drive, images: np.ndarray | None = Non
     return found
 
 
-def closed(drive: Drive, revisit: Revisit) -> tuple[SE2, SE2]:
-    """The path with the error of a revisit spread back to where the place was first seen.
+def closed(drive: TimedLines, revisit: Revisit) -> tuple[SE2, SE2]:
+    """The path with the error of a revisit distributed back to where the place was first seen.
 
     **Returns:** the path [T], and the motion [T] of what was seen from each of its poses.
     """
@@ -128,14 +132,14 @@ def closed(drive: Drive, revisit: Revisit) -> tuple[SE2, SE2]:
     return join(part(slice(0, a)), moved, same @ rest), join(still, motion, same)
 
 
-def moved_lines(drive: Drive, motion: SE2) -> Float[Array, "K 2 2"]:
+def moved_lines(drive: TimedLines, motion: SE2) -> Float[Array, "K 2 2"]:
     """The lines' end points, each moved with the pose from which it was first seen."""
     with_first = jax.tree.map(lambda v: v[drive.first], motion)
     return jax.vmap(lambda T, e: T.apply(e))(with_first, jnp.asarray(drive.endpoints_world))
 
 
-def joined_map(smoothed: Smoothed, drive: Drive, motion: SE2, revisit: Revisit) -> SegmentMap:
-    """The smoothed lines as a map to start from again, what was described twice only once."""
+def joined_map(smoothed: Smoothed, drive: TimedLines, motion: SE2, revisit: Revisit) -> SegmentMap:
+    """The smoothed lines as a map to start from again; duplicates of the revisit are merged."""
     lines, K = smoothed.lines, len(smoothed.measurements)
     later = np.zeros(K, bool)
     later[revisit.lines[:, 0]] = True

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sofjax._checks import check_fields
 from sofjax._pytree import in_double
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.camera import Camera, Mount
@@ -57,6 +58,14 @@ class SmoothingConfig(eqx.Module):
     room: int = eqx.field(static=True, default=kf.PAD)  # least sizes of what is compiled
     passing: float = 10.0  # metres driven after which a revisit starts a new line
     seeing: Seeing = Seeing()
+
+    def __check_init__(self) -> None:
+        check_fields(
+            self,
+            whole_from={"rounds": 1, "room": 1},
+            positive=("loss_scale", "step", "turn"),
+            at_least_zero=("min_measurements",),
+        )
 
 
 DEFAULT = SmoothingConfig()
