@@ -4,6 +4,8 @@ Corridors repeat. What fits at one place fits nearly as well a block farther on,
 trusted only if no other within reach of the uncertainty comes near it.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -140,7 +142,7 @@ def find(
     moves, step = hypotheses(config, sigma)
     value, _, _ = ask(moves, step)
 
-    def refined(move: np.ndarray) -> tuple[np.ndarray, ...]:
+    def refined(move: np.ndarray) -> tuple[Any, ...]:
         """The best move about one, to a sixteenth of the spacing; and what `score` says of it."""
         for spacing in (step / 4, step / 16):
             ticks = [s * np.arange(-4, 5) for s in spacing]
