@@ -51,6 +51,7 @@ def rng():
 
 # for what runs once or twice: most of a test's time is the compiler's
 jit_quickly = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+QUICK = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}  # the same for a process
 
 
 def as_float32(tree):

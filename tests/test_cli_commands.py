@@ -10,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from conftest import QUICK
 from test_cli import FILES, IMAGES, OFFICE, SMALL, make_drive, report_of, run
 from test_cli import done as done
 from test_cli import drive as drive
@@ -61,7 +62,9 @@ def test_a_real_ctrl_c(tmp_path):
     program += "runpy.run_module('sofjax', run_name='__main__')"
     command = [sys.executable, "-c", program, "run", str(OFFICE), "--out", str(tmp_path), *SMALL]
     command += ["--particles", "5000"]  # slow enough to be caught on a busy machine
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | QUICK
+    )
     trajectory, patience = tmp_path / "trajectory.txt", time.monotonic() + 300
     while not (trajectory.exists() and trajectory.read_text().count("\n") > 5):
         assert process.poll() is None and time.monotonic() < patience, process.communicate()[1]
@@ -140,7 +143,7 @@ def test_with_a_cache_the_second_start_compiles_nothing(drive, tmp_path):
     cache, kept = tmp_path / "cache", []
     for name in ("first", "second"):
         command = [sys.executable, "-m", "sofjax", "run", drive, "--out", tmp_path / name, *SMALL]
-        environment = {**os.environ, "SOFJAX_CACHE": str(cache)}
+        environment = {**os.environ, **QUICK, "SOFJAX_CACHE": str(cache)}
         subprocess.run(command, env=environment, capture_output=True, check=True)
         kept.append({file.name for file in cache.glob("*-cache")})
     assert kept[0] and kept[1] == kept[0]

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import QUICK
 from test_cli import make_drive
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -15,8 +16,6 @@ SAID = {
     "learn_noise": "log-evidence",
     "online": "lines in the map",
 }
-# most of the time is the compiler's; what is printed does not need fast programs
-QUICK = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +24,8 @@ def drive(tmp_path_factory):
 
 
 def output(name, *args):
-    command = [sys.executable, "-W", "error", EXAMPLES / f"{name}.py", *args]
+    strict = ["-W", "error", "-W", "ignore:Error reading persistent compilation cache entry"]
+    command = [sys.executable, *strict, EXAMPLES / f"{name}.py", *args]
     environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
     environment |= QUICK if name == "learn_noise" else {}
     done = subprocess.run(command, env=environment, capture_output=True, text=True)

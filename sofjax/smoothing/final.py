@@ -55,6 +55,6 @@ def _times_in_view(
         pose, real = keyframe
         T_world_robot = SE2(pose[:2], pose[2])
         seen = middles_in_view(config, camera, mount, ends, scale, T_world_robot)
-        return total + (seen & real), None
+        return total + (seen & real).astype(total.dtype), None
 
     return jax.lax.scan(add, jnp.zeros(len(ends), int), (pose, real))[0]
