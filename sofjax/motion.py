@@ -28,13 +28,13 @@ class MotionModel(eqx.Module):
     lateral_noise: float = 0.002  # metres per sqrt(metre)
     heading_noise: float = 0.005  # radians per sqrt(metre)
     turn_noise: float = 0.01  # radians per sqrt(radian)
-    distance_scale_sigma: float = 0.01
-    turn_scale_sigma: float = 0.05
-    curvature_sigma: float = 0.005  # radians per metre
+    distance_scale_sigma: float = 0.01  # prior of the relative error of distances
+    turn_scale_sigma: float = 0.05  # prior of the relative errors of left and of right turns
+    curvature_sigma: float = 0.005  # radians per metre, prior of the pull to one side
     bias_drift: float = 0.02  # share of its prior that a systematic error wanders in sqrt(metre)
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip
-    slip_turn: float = 0.05  # radians
+    slip_turn: float = 0.05  # radians, standard deviation of a slip
 
 
 class OdometerBias(eqx.Module):

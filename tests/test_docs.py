@@ -75,6 +75,7 @@ def test_the_page_of_settings_has_all_that_a_run_lists():
     listed = set(re.findall(r"^\| `([a-z_.]+)` ", page, re.MULTILINE))
     of_a_run = {name for name in to_dict(RunSettings()) if "." in name}
     assert of_a_run <= listed, of_a_run - listed
+    assert not re.findall(r"^\| `.*\| +\|$", page, re.MULTILINE)  # each says what it is
 
 
 def test_what_the_pages_link_to_is_there():

@@ -13,12 +13,12 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PACKAGE = {"cv2": "opencv-python-headless", "yaml": "pyyaml"}  # where it has another name
-TRIED = (  # each room once; half of them need programs that the oldest JAX has to compile
+TRIED = (  # what leans on each dependency; the sample drive is run besides
     "tests/test_geometry_floor.py",
+    "tests/test_motion.py",
+    "tests/test_likelihood.py",
     "tests/test_vision.py",
     "tests/test_calibrate_camera.py",
-    "tests/test_likelihood.py",
-    "tests/test_slam.py",
     "tests/test_evaluation.py",
 )
 
@@ -50,7 +50,7 @@ def test_every_package_that_is_imported_is_a_dependency():
 
 @pytest.mark.slow
 def test_the_lowest_versions_are_enough(tmp_path):
-    """In an environment of their own: tests of each room, and the sample drive from end to end."""
+    """In an environment of their own: some tests, and the sample drive from end to end."""
     venv.create(tmp_path / "lowest", with_pip=True)
     folder = tmp_path / "lowest" / "bin"
     lowest = [requirement.replace(">=", "==") for requirement in PROJECT["dependencies"]]

@@ -16,10 +16,10 @@ class Association(eqx.Module):
 
     alpha: float = 1.0  # weight of |rho' - rho''|, 1 / pixel
     beta: float = 60.0  # weight of |theta' - theta''|, 1 / radian
-    gate: float = 6.0  # Theta
-    temperature: float = 1.0  # of the soft gate, in units of epsilon; the soft filter alone has it
-    baseline_distance: float = 0.15  # metres between the two views ...
-    baseline_angle: float = 0.15  # ... or radians, whichever comes first
+    gate: float = 6.0  # Theta: epsilon must be below it
+    temperature: float = 1.0  # of the gate of the soft filter, in units of epsilon
+    baseline_distance: float = 0.15  # metres between the two views, or ...
+    baseline_angle: float = 0.15  # ... radians, whichever comes first
 
 
 class Matches(eqx.Module):

@@ -36,11 +36,11 @@ Scalar = Float[Array, ""] | float
 class SensorModel(eqx.Module):
     """Gaussian noise of a segment in (rho, theta), and the outlier cost."""
 
-    propagate: bool = eqx.field(static=True, default=True)  # or the paper's constant sigmas
+    propagate: bool = eqx.field(static=True, default=True)  # False: the paper's constant sigmas
     pixel_sigma: float = 0.5  # pixels, of an end point across its segment
     tilt_sigma: float = 0.001  # radians, attitude jitter: pitch and roll from image to image
-    rho_sigma: float = 0.02  # metres; the constant sigmas, and with `propagate` ...
-    theta_sigma: float = 0.02  # radians; ... unused
+    rho_sigma: float = 0.02  # metres; the constant sigma, unused with `propagate`
+    theta_sigma: float = 0.02  # radians; the constant sigma, unused with `propagate`
     upright: float = 1.0  # pixels that an upright's ends may be off a line to the nadir; 0: none
     theta_limit: float = 0.3  # radians; a segment whose direction is known less well is not used
     adaptation: float = 0.3  # share of the surplus error by which the variance inflates in a step

@@ -16,14 +16,14 @@ class MapConfig(eqx.Module):
     rule: str = eqx.field(static=True, default="kalman")  # or "gamma", eq. (14)
     classify: bool = eqx.field(
         static=True, default=True
-    )  # estimate the apparent scale, tell floor from above
+    )  # estimate the apparent scale, tell floor from off-floor
     directed: bool = eqx.field(static=True, default=False)  # tell a line's edges apart
-    capacity: int = eqx.field(static=True, default=1024)  # K
-    nearby: int = eqx.field(static=True, default=256)  # L, map lines that an image may show
+    capacity: int = eqx.field(static=True, default=1024)  # K, lines that the map has room for
+    nearby: int = eqx.field(static=True, default=256)  # map lines that an image may show, at most
     candidates: int = eqx.field(static=True, default=4)  # C, map lines compared per measurement
     range: float = 5.0  # R, metres: what is farther does not extend a segment
     length: float = 10.0  # L = 2 R, metres: a longer segment rests
-    rest: int = 10  # steps
+    rest: int = 10  # steps that a longer segment rests
     merge_distance: float = 0.01  # metres between doubled lines
     merge_angle: float = 0.035  # radians
     join_gap: float = 0.3  # metres between two pieces of one line

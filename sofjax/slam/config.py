@@ -15,13 +15,13 @@ CHOICES = ("resample", "winner")
 class FilterConfig(eqx.Module):
     """How many particles, and how the next generation is chosen."""
 
-    particles: int = eqx.field(static=True, default=1000)  # N
-    choice: str = eqx.field(static=True, default="resample")  # or "winner", the paper's
-    effective_share: float = 0.5  # resample below this share of N
+    particles: int = eqx.field(static=True, default=1000)  # N, number of particles
+    choice: str = eqx.field(static=True, default="resample")  # or "winner", as in the paper
+    effective_share: float = 0.5  # resampled below this effective size, a share of N
     gate_each: bool = eqx.field(
         static=True, default=False
     )  # Fig. 6, step 4: SoF for every particle
-    soft: bool = eqx.field(static=True, default=False)  # densities to differentiate; see `run`
+    soft: bool = eqx.field(static=True, default=False)  # for derivatives; see `SofSlam.run`
     max_depth: float = 8.0  # metres: farther segments are not used
 
     def __check_init__(self) -> None:
@@ -37,10 +37,10 @@ class FilterConfig(eqx.Module):
 class FixedLagConfig(eqx.Module):
     """How many keyframes stay open while driving."""
 
-    keyframes: int = eqx.field(static=True, default=0)  # W; 0: none
-    lines: int = eqx.field(static=True, default=128)  # J, the nearest of the map are solved for
-    step: float = 0.2  # metres between keyframes ...
-    turn: float = 0.15  # ... or radians
+    keyframes: int = eqx.field(static=True, default=0)  # W, open keyframes; 0: no window
+    lines: int = eqx.field(static=True, default=128)  # J, nearest map lines, solved for too
+    step: float = 0.2  # metres between keyframes, or ...
+    turn: float = 0.15  # ... radians, whichever comes first
 
     def __check_init__(self) -> None:
         check_fields(self, whole_from={"keyframes": 0, "lines": 1}, at_least_zero=("step", "turn"))
