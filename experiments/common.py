@@ -9,7 +9,8 @@ import os
 import platform
 import subprocess
 from pathlib import Path
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -120,7 +121,15 @@ def take_drive(
 
 
 @jax.jit
-def _observe(scene, camera, mounts, poses, motions, key, detection):
+def _observe(
+    scene: Scene,
+    camera: Camera,
+    mounts: Mount,
+    poses: SE2,
+    motions: SE2,
+    key: jax.Array,
+    detection: Detection,
+) -> Observation:
     return observe(scene, camera, mounts, poses, motions, key, detection, capacity=M)
 
 
@@ -140,10 +149,12 @@ def stack(drives: list[Drive]) -> tuple[Camera, Mount, Observation]:
 
 
 @jax.jit
-def run_batch(config, camera, mount, observations, keys) -> StepInfo:
+def run_batch(
+    config: SlamConfig, camera: Camera, mount: Mount, observations: Observation, keys: jax.Array
+) -> StepInfo:
     """The filter on every drive of a batch, each with its key; infos [drives, T]."""
 
-    def one(camera, mount, observations, key):
+    def one(camera: Camera, mount: Mount, observations: Observation, key: jax.Array) -> StepInfo:
         slam = SofSlam(config, camera, mount)
         return slam.run(slam.init(key, M), observations)[1]
 
@@ -194,7 +205,7 @@ def path_to_smooth(info: StepInfo) -> smoothing.Path:
     return smoothing.Path(info.T_world_robot, info.jitter, info.bias[-1])
 
 
-def one_of(batch, i: int):
+def one_of(batch: Any, i: int) -> Any:
     """One element of a batch."""
     return jax.tree.map(lambda leaf: leaf[i], batch)
 
@@ -207,7 +218,7 @@ def in_start(path: Trajectory) -> np.ndarray:
 
 
 @functools.cache
-def pyplot():
+def pyplot() -> ModuleType:
     """matplotlib without a screen."""
     import matplotlib
 
@@ -217,7 +228,7 @@ def pyplot():
     return plt
 
 
-def plain_ticks(axis) -> None:
+def plain_ticks(axis: Any) -> None:
     """A logarithmic axis at 1, 2, 5 and so on, in numbers as one writes them."""
     from matplotlib.ticker import LogLocator, NullLocator
 

@@ -84,7 +84,7 @@ def seeds_of(floor: str, first: int, count: int) -> list[int]:
     return found
 
 
-def run_variant(variant: str, drives: list[common.Drive], keys) -> list[float]:
+def run_variant(variant: str, drives: list[common.Drive], keys: jax.Array) -> list[float]:
     """The errors of all drives."""
     camera, mount, log = common.stack(drives)
     if variant == LEVER:
@@ -110,7 +110,9 @@ def drawn_drives(seed: int, images: int) -> dict[str, common.Drive]:
     return found
 
 
-def run_floor(floor: str, seeds: list[int], names: list[str], images: int, drawn: bool, done: dict):
+def run_floor(
+    floor: str, seeds: list[int], names: list[str], images: int, drawn: bool, done: dict
+) -> None:
     """All variants on the drives of a floor, what `done` holds already left out."""
     label = [f"{floor} {seed}" for seed in seeds]
     missing = lambda name: bool(set(label) - set(done.get(name, {})))

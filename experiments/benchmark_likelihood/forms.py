@@ -60,7 +60,7 @@ def make_problem(N: int, M: int, K: int, cloud: str, seed: int = 0) -> dict:
     }
 
 
-def arguments(problem: dict):
+def arguments(problem: dict) -> tuple[SE2, Segments, Segments, LineNoise]:
     """What `sofjax.log_likelihood` takes."""
     noise = ("sigma_rho", "sigma_theta", "e_max")
     xyt = jnp.asarray(problem["particles"], jnp.float32)
@@ -75,10 +75,12 @@ def arguments(problem: dict):
     )
 
 
-def naive(particles, observed, segment_map, noise):
+def naive(particles: SE2, observed: Segments, segment_map: Segments, noise: LineNoise) -> jax.Array:
     """The definition for one pair, under three vmaps."""
 
-    def pair(pose, seen, seen_valid, line, line_valid):
+    def pair(
+        pose: SE2, seen: jax.Array, seen_valid: jax.Array, line: jax.Array, line_valid: jax.Array
+    ) -> jax.Array:
         moved = pose.inverse().apply(line)
         d = polar_difference(polar_through(seen), polar_through(moved))
         e = (d[0] / noise.rho_sigma) ** 2 + (d[1] / noise.theta_sigma) ** 2
@@ -93,7 +95,7 @@ def naive(particles, observed, segment_map, noise):
     return -0.5 * jnp.where(observed.valid, cost, 0).sum(axis=-1)
 
 
-def in_numpy(problem: dict, chunk: int = 25):
+def in_numpy(problem: dict, chunk: int = 25) -> np.ndarray:
     """Broadcasting over [n, M, K] for chunks of particles that stay in the cache."""
     (x1, y1), (x2, y2) = problem["map"][problem["map_valid"]].reshape(-1, 2, 2).transpose(1, 2, 0)
     (u1, v1), (u2, v2) = problem["observed"].reshape(-1, 2, 2).transpose(1, 2, 0)
@@ -106,7 +108,7 @@ def in_numpy(problem: dict, chunk: int = 25):
     phi = np.arctan2(y2 - y1, x2 - x1)
     pi = np.float32(np.pi)
 
-    def some(x, y, yaw):
+    def some(x: np.ndarray, y: np.ndarray, yaw: np.ndarray) -> np.ndarray:
         c, s = np.cos(yaw), np.sin(yaw)
         moved = lambda X, Y: (c * (X - x) + s * (Y - y), c * (Y - y) - s * (X - x))
         a, b = moved(x1, y1), moved(x2, y2)  # [n, 1, K]
@@ -123,7 +125,7 @@ def in_numpy(problem: dict, chunk: int = 25):
     return np.concatenate([some(*part.T[:, :, None, None]) for part in parts])
 
 
-def by_pose(*arguments):
+def by_pose(*arguments: object) -> tuple[jax.Array, SE2]:
     """Value and gradient of each particle's own likelihood."""
     total = lambda particles: (
         lambda values: (values.sum(), values)
@@ -132,7 +134,15 @@ def by_pose(*arguments):
     return values, gradient
 
 
-def of_image(height_pitch, camera, mount, segments_image, particles, segment_map, noise):
+def of_image(
+    height_pitch: jax.Array,
+    camera: Camera,
+    mount: Mount,
+    segments_image: Segments,
+    particles: SE2,
+    segment_map: Segments,
+    noise: LineNoise,
+) -> jax.Array:
     """The soft form as a function of the mount."""
     mount = Mount(mount.x, mount.y, *height_pitch, mount.roll, mount.yaw)
     return sofjax.image_log_likelihood(
@@ -140,7 +150,7 @@ def of_image(height_pitch, camera, mount, segments_image, particles, segment_map
     )
 
 
-def by_mount(height_pitch, *arguments):
+def by_mount(height_pitch: jax.Array, *arguments: object) -> tuple[jax.Array, jax.Array]:
     """The same with both derivatives for each particle."""
     values, push = jax.linearize(lambda at: of_image(at, *arguments), height_pitch)
     return values, jax.vmap(push)(jnp.eye(2))

@@ -7,9 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sofjax.calibration import distances, start_at
+from sofjax.calibration import SegmentPairs, distances, start_at
+from sofjax.extraction import Observation
+from sofjax.geometry import SE2, Camera, Mount
 from sofjax.motion import MotionModel
-from sofjax.simulation import Detection, Odometer, Scene, observe, random_setup, simulate_run
+from sofjax.simulation import (
+    Detection,
+    Odometer,
+    Scene,
+    World,
+    observe,
+    random_setup,
+    simulate_run,
+)
 
 IMAGES = 160
 EXACT = Odometer(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -17,7 +27,9 @@ EXACT_MODEL = MotionModel(*[0.0] * 7)
 LSD = Detection(shortening=1.0, broken=0.0, false_segments=0.0, missed=0.05)
 
 
-def make_log(world, seed: int, noise: float, odometer: Odometer = EXACT):
+def make_log(
+    world: World, seed: int, noise: float, odometer: Odometer = EXACT
+) -> tuple[Camera, Mount, Observation]:
     """The camera of a random robot setup, at rest on it, its true mount and its log, in float64."""
     setup = dataclasses.replace(random_setup(seed), odometer=odometer, dropped=0.0, vibration=0.0)
     simulated = simulate_run(world, setup, seed, IMAGES)
@@ -39,7 +51,7 @@ def make_log(world, seed: int, noise: float, odometer: Odometer = EXACT):
 _observe = jax.jit(observe)
 
 
-def roughly(mount):
+def roughly(mount: Mount) -> Mount:
     """Where the fits begin: 10 % and 1.7° off."""
     return eqx.tree_at(
         lambda m: (m.height, m.pitch), mount, (mount.height * 1.1, mount.pitch + 0.03)
@@ -47,10 +59,10 @@ def roughly(mount):
 
 
 @eqx.filter_jit
-def cramer_rao(camera, mount, pairs, noise):
+def cramer_rao(camera: Camera, mount: Mount, pairs: SegmentPairs, noise: jax.Array) -> jax.Array:
     """Least standard deviations of (height, pitch, roll) from these pairs, every line unknown."""
 
-    def one(first, second, T):
+    def one(first: jax.Array, second: jax.Array, T: SE2) -> jax.Array:
         of = lambda by, a, b: distances(
             camera, start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])), a, b, T
         )[:2]

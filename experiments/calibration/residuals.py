@@ -22,6 +22,7 @@ from logs import EXACT_MODEL, cramer_rao, make_log, roughly
 
 from sofjax.calibration import (
     PairNoise,
+    SegmentPairs,
     TrackConfig,
     distances,
     expected,
@@ -31,6 +32,9 @@ from sofjax.calibration import (
     start_at,
 )
 from sofjax.geometry import (
+    SE2,
+    Camera,
+    Mount,
     line_through,
     polar,
     polar_difference,
@@ -44,18 +48,20 @@ NOISE, CAPACITY = 0.5, 1024
 
 
 @eqx.filter_jit
-def polar_fit(camera, mount, pairs, sigma):
+def polar_fit(
+    camera: Camera, mount: Mount, pairs: SegmentPairs, sigma: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """The same fit with (rho, theta) of the second segment minus those of the carried line."""
     centre = jnp.eye(3).at[:2, 2].set(-camera.K[:2, 2])
 
-    def one(by, first, second, T):
+    def one(by: jax.Array, first: jax.Array, second: jax.Array, T: SE2) -> jax.Array:
         moved = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])).mount
         H = centre @ two_view_homography(camera, moved, T) @ jnp.linalg.inv(centre)
         ends = lambda s: s - camera.K[:2, 2]
         carried = transfer_line(H, line_through(*ends(first)))
         return polar_difference(polar(line_through(*ends(second))), polar(carried)) / sigma
 
-    def residuals(by, _):
+    def residuals(by: jax.Array, _: object) -> jax.Array:
         r = jax.vmap(one, (None, 0, 0, 0))(by, pairs.first, pairs.second, pairs.T_first_second)
         return jax.vmap(robust, (0, None))(jnp.where(pairs.valid[:, None], r, 0), 2.0)
 
@@ -68,13 +74,15 @@ def polar_fit(camera, mount, pairs, sigma):
     return jnp.stack([m.height, m.pitch, m.roll]), C * jnp.outer(unit, unit)
 
 
-def endpoint_fit(camera, mount, pairs):
+def endpoint_fit(camera: Camera, mount: Mount, pairs: SegmentPairs) -> tuple[jax.Array, jax.Array]:
     found = fit_mount(camera, mount, pairs)
     m = found.mount
     return jnp.stack([m.height, m.pitch, m.roll]), found.covariance[:3, :3]
 
 
-def fit_all(camera, mount, start, pairs, exact):
+def fit_all(
+    camera: Camera, mount: Mount, start: Mount, pairs: SegmentPairs, exact: SegmentPairs
+) -> tuple[dict, jax.Array]:
     """All three fits of one log, and the bound."""
     constant = jnp.array([5.0, 0.03])  # pixels and radians
     tight = jnp.array([1.0, 0.015])
@@ -86,7 +94,7 @@ def fit_all(camera, mount, start, pairs, exact):
     }, cramer_rao(camera, mount, pairs, jnp.asarray(NOISE))
 
 
-def study(seed: int):
+def study(seed: int) -> tuple[dict, np.ndarray, int, float] | None:
     """Errors, sigmas and the bound of one log; None where it has too few pairs for any fit."""
     camera, mount, log = make_log(make_world("random", seed), seed, NOISE)
     rough = roughly(mount)

@@ -21,7 +21,7 @@ import common
 from logs import EXACT, EXACT_MODEL, cramer_rao, make_log, roughly
 
 from sofjax.calibration import TURNS, DriveFitConfig, FitConfig, PairNoise, TrackConfig, fit_drive
-from sofjax.simulation import Odometer, around, furnish, make_world
+from sofjax.simulation import Odometer, World, around, furnish, make_world
 
 NOISE, CAPACITY = 0.5, 1024
 MOUNT = ("height", "pitch", "roll")
@@ -58,7 +58,7 @@ VARIATIONS = {
 }  # fmt: skip
 
 
-def corridor(floor: str, seed: int):
+def corridor(floor: str, seed: int) -> World:
     """An L-shaped corridor with a floor of one's choice."""
     bend = np.array([[0, 0], [0, 9], [8, 9]], float)
     way = np.array([[0, -0.3], [0, 9], [7.6, 9]], float)

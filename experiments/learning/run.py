@@ -27,8 +27,12 @@ import optimistix as optx
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
+from sofjax import SlamConfig
+from sofjax.extraction import Observation
+from sofjax.geometry import SE2, Camera, Mount
 from sofjax.simulation import make_world, random_setup
 
+Batch = tuple[Camera, Mount, Observation]  # of several drives
 NOISE = (
     ("sensor", "pixel_sigma"), ("sensor", "tilt_sigma"),
     ("motion", "distance_noise"), ("motion", "lateral_noise"),
@@ -61,7 +65,7 @@ STARTS = {  # times the default noise, and the drives
 }
 
 
-def soft_config(particles: int):
+def soft_config(particles: int) -> SlamConfig:
     return common.config_of(
         filter={"particles": particles, "soft": True, "gate_each": True},
         segment_map={"capacity": 192},
@@ -69,16 +73,16 @@ def soft_config(particles: int):
     )
 
 
-def usual_config(particles: int):
+def usual_config(particles: int) -> SlamConfig:
     return common.config_of(filter={"particles": particles}, segment_map={"capacity": 192})
 
 
-def where(config):
+def where(config: SlamConfig) -> list:
     return [getattr(getattr(config, part), name) for part, name in NAMES]
 
 
 @eqx.filter_jit
-def run(base, x, drives, keys):
+def run(base: SlamConfig, x: jax.Array, drives: Batch, keys: jax.Array) -> tuple[jax.Array, SE2]:
     """Evidence a detected segment and poses, for each drive and each key."""
     config = eqx.tree_at(where, jax.tree.map(jnp.asarray, base), list(jnp.exp(x)))
     many = lambda k: common.run_batch(config, *drives, jnp.broadcast_to(k, drives[0].K.shape[:1]))
@@ -86,11 +90,13 @@ def run(base, x, drives, keys):
     return info.log_evidence.sum(-1) / info.detected.sum(-1), info.T_world_robot
 
 
-def learn(base, start, drives, keys, steps: int):
+def learn(
+    base: SlamConfig, start: jax.Array, drives: Batch, keys: jax.Array, steps: int
+) -> tuple[jax.Array, int]:
     """Maximise the mean evidence of a segment, the random numbers fixed."""
     segments = drives[2].segments_image.valid.sum()
 
-    def loss(x, _):
+    def loss(x: jax.Array, _: object) -> jax.Array:
         prior = 0.5 * jnp.sum(((x - start) / REACH) ** 2) / segments
         return prior - run(base, x, drives, keys)[0].mean()
 
@@ -99,11 +105,13 @@ def learn(base, start, drives, keys, steps: int):
     return found.value, int(found.stats["num_steps"])
 
 
-def compare_gradients(base, x, drives, keys) -> dict[str, dict]:
+def compare_gradients(
+    base: SlamConfig, x: jax.Array, drives: Batch, keys: jax.Array
+) -> dict[str, dict]:
     """The mean gradient over the keys against central differences, both with standard errors."""
 
     @functools.partial(jax.jit, static_argnums=0)
-    def over_keys(base, x):
+    def over_keys(base: SlamConfig, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         one = lambda x, key: run(base, x, drives, key[None])[0].mean()
         return jax.lax.map(lambda key: jax.value_and_grad(one)(x, key), keys)
 
@@ -124,7 +132,9 @@ def compare_gradients(base, x, drives, keys) -> dict[str, dict]:
     return rows
 
 
-def judge(x, sizes, drives, kept_back, keys) -> dict[str, list]:
+def judge(
+    x: jax.Array, sizes: int, drives: Batch, kept_back: list[common.Drive], keys: jax.Array
+) -> dict[str, list]:
     """On the drives kept back: the evidence of each, and its median error by either filter."""
     evidence, poses = run(soft_config(sizes), x, common.stack(kept_back), keys)
     usual = run(usual_config(sizes), x, common.stack(kept_back), keys)[1]

@@ -61,7 +61,9 @@ def differences(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.nd
     return distance, np.abs((angle + np.pi / 2) % np.pi - np.pi / 2)
 
 
-def visible(H_F: np.ndarray, size: tuple, nadir: np.ndarray, points: np.ndarray, walls: np.ndarray):
+def visible(
+    H_F: np.ndarray, size: tuple, nadir: np.ndarray, points: np.ndarray, walls: np.ndarray
+) -> np.ndarray:
     """Which floor points [n, 2] are in the picture, near enough and not behind a wall."""
     x = np.column_stack([points, np.ones(len(points))]) @ H_F.T
     depth = np.where(x[:, 2] > 0.1, x[:, 2], np.inf)
@@ -76,7 +78,7 @@ def visible(H_F: np.ndarray, size: tuple, nadir: np.ndarray, points: np.ndarray,
     )
     for a, b in walls:
 
-        def side(p, q, r):
+        def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
             return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
                 r[..., 0] - p[..., 0]
             )

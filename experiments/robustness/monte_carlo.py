@@ -18,6 +18,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 import common
 
 from sofjax.evaluation import align
+from sofjax.io.trajectory import Trajectory
 from sofjax.simulation import make_world
 
 WORLDS = ("paper", "l", "random")
@@ -41,7 +42,7 @@ def run_seeds(world: str, seeds: list[int], folder: Path, images: int) -> None:
                   f"NEES {np.nanmedian(result['nees']):.1f}", flush=True)  # fmt: skip
 
 
-def judge(drive, path, covariances) -> dict[str, np.ndarray]:
+def judge(drive: common.Drive, path: Trajectory, covariances: np.ndarray) -> dict[str, np.ndarray]:
     """Errors, and the normalised squared error of every pose in the frame of the first."""
     T = len(path.stamps)
     error = np.column_stack([path.xy, path.yaw]) - common.in_start(drive.truth)

@@ -21,12 +21,13 @@ import common
 
 from sofjax import SofSlam, smoothing
 from sofjax.evaluation import evaluate_trajectory
-from sofjax.simulation import around, furnish, random_setup
+from sofjax.geometry import SE2
+from sofjax.simulation import World, around, furnish, random_setup
 
 WIDTH, HEIGHT, GAP = 7.0, 11.0, 5.0  # metres, of a ring and to the next
 
 
-def make_rings(seed: int, rings: int):
+def make_rings(seed: int, rings: int) -> World:
     rng = np.random.default_rng([seed, 71])
     way = [[0, 0]]
     for left in (WIDTH + GAP) * np.arange(rings):
@@ -42,7 +43,7 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 
 
-def draw(drive, online, done, path: Path) -> None:
+def draw(drive: common.Drive, online: SE2, done: smoothing.Smoothed, path: Path) -> None:
     from matplotlib.collections import LineCollection
 
     plot, (above, below) = common.pyplot().subplots(2, 1, figsize=(11, 5.5), layout="constrained")

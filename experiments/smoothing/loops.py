@@ -20,18 +20,18 @@ from scipy.stats import chi2
 sys.path.append(str(Path(__file__).parents[1]))
 import common
 
-from sofjax import SofSlam, loop_closure
+from sofjax import SofSlam, loop_closure, smoothing
 from sofjax.evaluation import evaluate_trajectory
 from sofjax.geometry import SE2
 from sofjax.io.trajectory import Trajectory
-from sofjax.simulation import around, furnish, random_setup
+from sofjax.simulation import World, around, furnish, random_setup
 
 FLOORS = ("blocks", "tiles", "stripes", "planks")  # of the drives without a loop
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the way, at which poses are judged
 RIGHT = 0.1  # metres by which the end may be off the begin if the loop counts as closed
 
 
-def make_loop(seed: int, size: float = 1.0):
+def make_loop(seed: int, size: float = 1.0) -> World:
     """A ring of 26 m to 64 m, of which 5 m to 9 m are driven twice."""
     rng = np.random.default_rng([seed, 61])
     w, h, width = size * rng.uniform(5, 12), size * rng.uniform(8, 20), rng.uniform(1.9, 2.5)
@@ -43,7 +43,7 @@ def make_loop(seed: int, size: float = 1.0):
     return furnish("loop", around(ring, width), way, "blocks", rng)
 
 
-def make_way(seed: int, size: float = 1.0):
+def make_way(seed: int, size: float = 1.0) -> World:
     """Stairs of corridors, 30 m to 65 m, over a floor that repeats."""
     rng = np.random.default_rng([seed, 67])
     legs = size * rng.uniform(8, 16, int(rng.integers(3, 5)))
@@ -81,7 +81,7 @@ def drive_one(kind: str, seed: int, size: float) -> dict[str, object]:
     }  # fmt: skip
 
 
-def apart(drive, path: SE2 | Trajectory) -> float | None:
+def apart(drive: common.Drive, path: SE2 | Trajectory) -> float | None:
     """How far the last pose is from where it should be by the pose that came nearest to it, m.
 
     None where nothing within a metre was passed ten metres earlier.
@@ -98,7 +98,7 @@ def apart(drive, path: SE2 | Trajectory) -> float | None:
     return float(np.hypot(*(local(xy, yaw) - local(drive.truth.xy, drive.truth.yaw))))
 
 
-def nees(drive, path, smoothed) -> np.ndarray:
+def nees(drive: common.Drive, path: Trajectory, smoothed: smoothing.Smoothed) -> np.ndarray:
     """Normalised squared errors (x, y, yaw) of four keyframes in the frame of the first."""
     index = smoothed.index
     at = np.searchsorted(index, [index[-1] * s for s in SHARES])

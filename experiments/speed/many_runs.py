@@ -9,6 +9,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 # every core a device; before jax begins
@@ -23,6 +24,7 @@ import common
 
 from sofjax import SofSlam
 from sofjax.extraction import Observation
+from sofjax.slam import StepInfo
 
 TOGETHER = 16  # runs side by side on a core: what they work on then fits into its cache
 
@@ -48,11 +50,11 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
     config = common.config_of(filter={"particles": 256})
     keys = jax.random.split(jax.random.key(seed), runs)
 
-    def run(log, key):
+    def run(log: Observation, key: jax.Array) -> StepInfo:
         slam = SofSlam(config, drive.camera, drive.mount)
         return slam.run(slam.init(key, M), log)[1]
 
-    def share(log, keys):
+    def share(log: Observation, keys: jax.Array) -> StepInfo:
         return jax.lax.map(lambda key: run(log, key), keys, batch_size=TOGETHER)
 
     mesh = jax.make_mesh((len(jax.devices()),), ("runs",), axis_types=(AxisType.Auto,))
@@ -67,7 +69,7 @@ def many_runs(seed: int, images: int, runs: int, rounds: int = 3) -> dict[str, f
     )
     together = lambda: on_all_devices(log_of_all, keys_of_all)
 
-    def timed(call):
+    def timed(call: Callable[[], object]) -> tuple[float, float]:
         c, w = time.process_time(), time.perf_counter()
         jax.block_until_ready(call())
         return time.process_time() - c, time.perf_counter() - w

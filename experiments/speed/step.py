@@ -10,6 +10,7 @@ on one machine this shows that the results are the same, not that it is faster, 
 uses all cores already. On a cluster, start `worker.py` on each machine.
 """
 
+import argparse
 import json
 import socket
 import subprocess
@@ -82,7 +83,7 @@ def draw(table: dict, path: Path) -> None:
     plot.savefig(path, dpi=110)
 
 
-def start(args, processes):
+def start(args: argparse.Namespace, processes: int) -> dict:
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
@@ -99,7 +100,7 @@ def start(args, processes):
     return json.loads(said[0].splitlines()[-1])
 
 
-def steps(args):
+def steps(args: argparse.Namespace) -> dict[str, dict]:
     table = {}
     for name, sizes in (FEW if args.quick else SIZES).items():
         table[name] = {}
@@ -111,7 +112,7 @@ def steps(args):
     return table
 
 
-def runs_of(args):
+def runs_of(args: argparse.Namespace) -> dict[str, float]:
     size = ["--images", "10", "--runs", "4"] if args.quick else []
     script = Path(__file__).with_name("many_runs.py")
     command = [sys.executable, str(script), "--seed", str(args.seed), *size]
@@ -120,7 +121,7 @@ def runs_of(args):
     return json.loads(said)
 
 
-def processes_of(args):
+def processes_of(args: argparse.Namespace) -> dict[str, object]:
     one, many = start(args, 1), start(args, args.processes)
     apart = float(np.abs(np.array(one.pop("xy")) - np.array(many.pop("xy"))).max())
     processes = {"one": one, "many": many, "furthest_apart_m": apart}
@@ -128,7 +129,7 @@ def processes_of(args):
     return processes
 
 
-def main():
+def main() -> None:
     parser = common.options(__doc__, __file__)
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--images", type=int, default=20)
