@@ -1,4 +1,4 @@
-"""What is worked out of arrays with a mask, whose last places mostly hold nothing."""
+"""Trees of padded arrays, whose tail is usually padding, and trees in double precision."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 
 def half_if_enough(f: Callable[[PyTree], PyTree], rows: PyTree, there: Bool[Array, "M"]) -> PyTree:
-    """f(rows), worked out of their first half where the second holds nothing.
+    """f(rows), computed from their first half where the second is padding.
 
     **Arguments:**
     - `f`: what it returns must not depend on rows that hold nothing, nor have rows itself.

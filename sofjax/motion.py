@@ -127,7 +127,7 @@ def sample_motion(
     S = A @ covariance @ A.T + noise  # diagonal: distance and turn share no error
     sigma = safe_sqrt(jnp.diag(S))
     # one draw for all: a key for each particle costs more than the rest of this; the particles last
-    # and by a product of matrices, as XLA would otherwise draw anew for whoever asks
+    # and by a product of matrices: it prevents XLA from drawing again for each consumer
     draw = jax.random.normal(key, (3, *bias.mean.shape[:-1]))
     sigmas = jnp.append(sigma, model.lateral_noise * safe_sqrt(distance))
     noise = jnp.tensordot(draw, jnp.diag(sigmas), axes=(0, 0))
@@ -213,7 +213,7 @@ def sample_slip(
     along, turn = model.slip_distance * along, model.slip_turn * turn
     each = SE2.exp(jnp.stack([along, jnp.zeros(trying), turn], axis=-1))
     each = jnp.where(possible, jnp.concatenate([each.xy, each.yaw[:, None]], axis=1), 0)
-    # put in their places, as XLA would work each out anew for all of its twenty
+    # scattered to their places: it prevents XLA from recomputing each for all of its twenty
     slip = jnp.zeros((count, 3)).at[tries].set(each, mode="drop")
     probability = jnp.where(possible, probability, 1 / ONE_IN)
     log_weight = jnp.full(count, jnp.log1p(-probability) - jnp.log1p(-1 / ONE_IN))

@@ -1,4 +1,4 @@
-"""How far a loop over the images has come, for whoever shows it."""
+"""How far a loop over the images has come, to be shown."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar

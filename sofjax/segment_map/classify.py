@@ -1,7 +1,7 @@
 """What lies on the floor, and what the final map shows: each by one rule, for filter and smoother.
 
 A line's apparent scale h / (h - z) is 1 on the floor, more above it, less below. It is estimated
-from all views of the line, so that the top of a baseboard and a reflection are told from the floor.
+from all views of the line, which separates the top of a baseboard and a reflection from the floor.
 """
 
 import equinox as eqx
@@ -41,9 +41,9 @@ def is_shown(
 ) -> Bool[Array, "*lines"]:
     """The final map's rule: lines seen often enough whose height is known to be the floor's.
 
-    What runs along the robot's path hardly changes its apparent scale: the top of a baseboard that
-    was only ever passed by is neither told from the floor nor shown. What is nearly known is shown
-    if it would be the floor's.
+    The apparent scale of a line along the robot's path hardly changes: the top of a baseboard that
+    was only ever passed by cannot be separated from the floor, and is not shown. What is nearly
+    known is shown if it would be the floor's.
 
     **Arguments:**
     - `sigma`: standard deviation of the apparent scale.

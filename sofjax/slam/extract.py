@@ -1,4 +1,4 @@
-"""Step 4 of Fig. 6: the segments of the image, put on the floor and told from other lines."""
+"""Step 4 of Fig. 6: the segments of the image, put on the floor and separated from other lines."""
 
 import equinox as eqx
 import jax

@@ -145,7 +145,7 @@ def distances(unknowns: Unknowns, problem: Problem) -> Float[Array, "n M 2"]:
     return jax.vmap(of_keyframe)(unknowns.pose, k.segments_image.endpoints, k.line, k.known)
 
 
-def misfit(problem: Problem) -> Float[Array, ""]:
+def rms_distance(problem: Problem) -> Float[Array, ""]:
     """Root mean square of the distances at the start, pixels; zero where nothing is known."""
     known = 2 * problem.keyframes.known.sum()
     total = jnp.sum(distances(problem.start, problem) ** 2)

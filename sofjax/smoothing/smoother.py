@@ -37,7 +37,7 @@ from sofjax.smoothing.problem import (
     Problem,
     Unknowns,
     corrected,
-    misfit,
+    rms_distance,
 )
 from sofjax.smoothing.solution import TOLERANCE, Solution, solve
 from sofjax.smoothing.sparse.dissection import Dissection, dissect, divide
@@ -242,7 +242,7 @@ def _associated(
     most = int(known.sum(axis=1).max())
     if problem.keyframes.known.any():  # as wide as before at least
         width = max(kf.padded(most, NARROW), problem.keyframes.known.shape[1])
-    else:  # better poses show more: room for them, lest all is compiled again
+    else:  # better poses show more lines: headroom against recompilation
         width = kf.padded(5 * most // 4, NARROW)
     frames = _narrowed(frames, min(width, known.shape[1]))
     return eqx.tree_at(lambda p: p.keyframes, problem, frames)
@@ -275,7 +275,7 @@ def _settled(
 
 def _with_pixel_sigma(config: SlamConfig, problem: Problem) -> Problem:
     """The pixels are trusted less where they disagree more than they should."""
-    sigma = jnp.maximum(misfit(problem), config.sensor.pixel_sigma)
+    sigma = jnp.maximum(rms_distance(problem), config.sensor.pixel_sigma)
     return eqx.tree_at(lambda p: p.priors.pixel_sigma, problem, sigma)
 
 

@@ -1,4 +1,4 @@
-"""What is worked out once per particle, per observed segment and per map segment, before the pairs.
+"""What is computed once per particle, observed segment and map segment, before the pairs.
 
 A pair then costs a dozen additions and products. All of it is near the origin: positions count
 from the middle of the cloud of particles, headings from that of the first particle, so that

@@ -223,7 +223,7 @@ def _by_map(
     """The same value by plain JAX, one map segment at a time, for the derivatives by the map.
 
     Only the [M, N] sum is carried. It is linear in what a step adds, so going back needs no copy of
-    it, and the step is worked out again instead of kept.
+    it, and the step is recomputed instead of kept.
     """
     across = jax.tree.map(lambda leaf: leaf[:, None], seen)
 

@@ -50,7 +50,7 @@ NEAREST = 256  # lines about a keyframe that its segments may show
 
 
 class Seeing(eqx.Module):
-    """How segments are told to show lines."""
+    """Gates by which a segment is associated with a line."""
 
     gate: float = 3.0  # pixels that an end may be off its line
     angle: float = 0.15  # radians between a segment and its line in the image

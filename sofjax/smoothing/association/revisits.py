@@ -1,4 +1,4 @@
-"""Which segments a line keeps: told apart by the pass, joined, and left out where they bend it."""
+"""Which segments a line keeps: split by revisit, merged, and dropped where they contradict it."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ def apart(
     baseboard, each is taken for the other and so are all beside them: no solution leads back.
 
     **Arguments:**
-    - `passing`: metres driven after which what is seen again is told anew.
+    - `passing`: metres driven after which a revisit starts a new line until it is merged.
     - `least`: measurements that make a line; fewer are left out.
     - `room`: least size of what is compiled.
     """

@@ -19,7 +19,7 @@ BRANCH = 4  # nodes that are gathered to one
 LEAF = 48  # keyframes of a leaf at most
 SHORT, LEAF_OF_SHORT = 1024, 128  # short drives compile longer than they compute: a lower tree
 ROUND = 16  # sizes of a node's tables are multiples of it
-SLACK = 1.15  # better poses show more: room for that, lest all is compiled again
+SLACK = 1.15  # better poses show more lines: headroom against recompilation
 
 
 class Generation(eqx.Module):
