@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from test_calibrate_camera import ARGS, HEIGHT, WIDTH, write
 from test_calibrate_camera import boards as boards
+from test_calibrate_camera import rays as rays
 
 from sofjax.cli import arguments, main
 from sofjax.io.camera_file import mount_fields

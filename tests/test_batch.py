@@ -10,7 +10,6 @@ from sofjax.extraction.sof import put_on_floor
 from sofjax.geometry import SE2, Camera, Mount, Segments
 from sofjax.likelihood import LineNoise
 from sofjax.likelihood.batch import (
-    culling,
     image_log_likelihood,
     log_likelihood,
     log_likelihood_pruned,
@@ -191,15 +190,6 @@ def test_a_particle_that_is_lost_in_nan_spoils_no_other():
 
 
 # --- degenerate inputs: right in value, finite in every derivative
-
-
-# --- derivatives
-
-
-@pytest.fixture
-def short_programs(monkeypatch, x64):
-    """Groups of two pairs, so that compiling does not take longer than all else; in float64."""
-    monkeypatch.setattr(culling, "_group_size", lambda K, prune: 2)
 
 
 # --- memory

@@ -24,9 +24,16 @@ from test_batch import (
 from sofjax.geometry import SE2, Segments
 from sofjax.likelihood import LineNoise
 from sofjax.likelihood.batch import (
+    culling,
     image_log_likelihood,
     log_likelihood,
 )
+
+
+@pytest.fixture
+def short_programs(monkeypatch, x64):
+    """Groups of two pairs, so that compiling does not take longer than all else; in float64."""
+    monkeypatch.setattr(culling, "_group_size", lambda K, prune: 2)
 
 
 def degenerate(name, N):

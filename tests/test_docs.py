@@ -21,7 +21,7 @@ PAGES = {
     for page in sorted((ROOT / "docs").glob("*.md"))
     if page.stem not in ("api", "settings", "studies")  # made of the code
 }
-COSTLY = ("calibrate",)
+COSTLY = ("calibrate", "many_particles")  # minutes each
 
 
 def blocks(text, language):

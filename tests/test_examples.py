@@ -39,6 +39,10 @@ def test_every_example_is_short_and_tested():
     assert all(len(file.read_text().splitlines()) < 50 for file in files)
 
 
-@pytest.mark.parametrize("name", SAID)
+# the first is what the README's code does, which is tested as well
+MARKED = [pytest.param(name, marks=[pytest.mark.slow] * (name == "quickstart")) for name in SAID]
+
+
+@pytest.mark.parametrize("name", MARKED)
 def test_an_example_runs(name, drive):
     assert SAID[name] in output(name, *([] if name == "batch_likelihood" else [drive]))

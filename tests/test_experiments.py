@@ -30,6 +30,7 @@ def test_every_study_has_the_common_options_and_a_page(script, monkeypatch, caps
     assert (script.parent / "README.md").is_file()
 
 
+@pytest.mark.slow
 def test_the_one_command_runs_what_is_named(tmp_path):
     done = run("--quick", "benchmark_likelihood", "--out", tmp_path)
     assert done.returncode == 0, done.stdout

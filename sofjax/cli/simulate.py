@@ -92,7 +92,7 @@ def choose_setup(args: argparse.Namespace) -> "RobotSetup":
     )
 
 
-def _limit(name: str) -> float:
+def _limit(name: str) -> int | float:
     """The largest value of a mount's field, metres or degrees."""
     return LARGEST_TURN if name in ("roll", "yaw") else LARGEST_OTHER
 
