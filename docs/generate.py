@@ -11,6 +11,8 @@ import tokenize
 from pathlib import Path
 from types import ModuleType
 
+from sofjax.pipeline import RunSettings
+
 MODULES = {  # the API page, from the ground up
     "sofjax.geometry": "The ground: eqs. (1) to (8) and (10) to (13)",
     "sofjax.extraction": "Segments on the floor: eq. (9) and Fig. 5",
@@ -71,6 +73,9 @@ def settings_page() -> str:
         "`motion.*_noise` (how it scatters), `sensor.tilt_sigma` (how the mount shakes) and "
         "`sensor.pixel_sigma`. Rather too large than too small.",
     ]
+    comments = field_comments(RunSettings)
+    own = [(name, getattr(RunSettings(), name), comments[name]) for name in ("seed", "loop")]
+    out += ["## A run", _rows(own)]
     for prefix, (module, name) in SETTINGS.items():
         kind = getattr(importlib.import_module(module), name)
         out += [f"## {prefix}", f"`{name}`: {_first_paragraph(kind)}", _table(prefix, kind)]
@@ -79,10 +84,17 @@ def settings_page() -> str:
 
 def _table(prefix: str, kind: type) -> str:
     comments = field_comments(kind)
+    return _rows([
+        (f"{prefix}.{field.name}", field.default, comments.get(field.name, ""))
+        for field in dataclasses.fields(kind)
+    ])  # fmt: skip
+
+
+def _rows(settings: list[tuple[str, object, str]]) -> str:
     rows = ["| setting | default | |", "|---|---|---|"]
-    for field in dataclasses.fields(kind):
-        about = comments.get(field.name, "").replace("|", "\\|")
-        rows.append(f"| `{prefix}.{field.name}` | `{field.default!r}` | {about} |")
+    for name, default, about in settings:
+        about = about.replace("|", "\\|")
+        rows.append(f"| `{name}` | `{default!r}` | {about} |")
     return "\n".join(rows)
 
 

@@ -1,11 +1,14 @@
 """Trees of padded arrays, whose tail is usually padding, and trees in double precision."""
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, PyTree
+
+Tree = TypeVar("Tree")
 
 
 def half_if_enough(f: Callable[[PyTree], PyTree], rows: PyTree, there: Bool[Array, "M"]) -> PyTree:
@@ -38,7 +41,7 @@ def _of_batch(
     return in_any_run(condition.any()), False
 
 
-def in_double(tree: PyTree) -> PyTree:
+def in_double(tree: Tree) -> Tree:
     """The tree with its floating point leaves in float64; to be called where x64 is enabled."""
 
     def one(leaf: ArrayLike) -> Array:

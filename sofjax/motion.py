@@ -9,6 +9,7 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from sofjax._checks import check_fields
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
@@ -35,6 +36,9 @@ class MotionModel(eqx.Module):
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip
     slip_turn: float = 0.05  # radians, standard deviation of a slip
+
+    def __check_init__(self) -> None:
+        check_fields(self, at_least_zero=tuple(field.name for field in dataclasses.fields(self)))
 
 
 class OdometerBias(eqx.Module):

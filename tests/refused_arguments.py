@@ -8,13 +8,17 @@ import jax.numpy as jnp
 from sofjax import (
     PRESETS,
     SE2,
+    Association,
     Camera,
+    FilterConfig,
     LineNoise,
+    MotionModel,
     Mount,
     Segments,
     SofSlam,
     image_log_likelihood,
     log_likelihood,
+    pose_log_likelihood,
 )
 
 poses = SE2(jnp.zeros((4, 2)), jnp.zeros(4))
@@ -26,6 +30,9 @@ mount = Mount.create(0.5, 0.4)
 whole = SE2(jnp.zeros((4, 2), int), jnp.zeros(4, int))
 lost = SE2(poses.xy.at[3].set(jnp.nan), poses.yaw)
 config = PRESETS["default"]
+slam = SofSlam(config, camera, mount)
+state = slam.init(jax.random.key(0), 1)
+seen_image = Segments.of([[[300.0, 400.0], [10.0, 400.0]]])
 calls = {
     "integer poses": lambda: log_likelihood(whole, seen, seen, noise),
     "one pose": lambda: log_likelihood(SE2(jnp.zeros(2), jnp.zeros(())), seen, seen, noise),
@@ -49,6 +56,16 @@ calls = {
     ),
     "metres for pixels": lambda: image_log_likelihood(camera, mount, poses, seen, seen, noise),
     "mount before camera": lambda: image_log_likelihood(mount, camera, poses, seen, seen, noise),
+    "pixels of a small image for metres": lambda: log_likelihood(
+        poses, Segments.of([[[300.0, 200.0], [10.0, 100.0]]]), seen, noise
+    ),
+    "a pose of a filter that is not a number": lambda: pose_log_likelihood(
+        slam, state, seen_image, lost
+    ),
+    "an image before the state": lambda: pose_log_likelihood(slam, seen_image, state, poses),
+    "a negative noise of the motion": lambda: MotionModel(turn_noise=-0.1),
+    "a gate that is not a number": lambda: Association(gate=float("nan")),
+    "a choice that is none": lambda: FilterConfig(choice="winer"),
     "an int as key": lambda: SofSlam(config, camera, mount).init(0, 64),
     "camera before settings": lambda: SofSlam(camera, mount, config),
 }

@@ -219,7 +219,7 @@ def test_the_choice_is_the_candidate_that_costs_least(rng):
         assert found.choice[m] == np.argmin(errors)
 
 
-def test_a_off_floor_line_moves_by_its_magnification():
+def test_an_off_floor_line_moves_by_its_magnification():
     """Driving 10 cm nearer to a line that seems 1.5 times as far brings its image 15 cm nearer."""
     W = np.broadcast_to(1e4 * np.eye(2), (1, 1, 2, 2))
     arrays = as_arrays(

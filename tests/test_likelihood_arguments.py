@@ -30,6 +30,12 @@ SAID = {
     "covariances of another size": "covariance must be [1, 2, 2], not [2, 2]",
     "metres for pixels": "it must be in pixels; metres of the robot frame go into log_likelihood",
     "mount before camera": "camera must be a Camera, not Mount",
+    "pixels of a small image for metres": "it must be in metres of the robot frame",
+    "a pose of a filter that is not a number": "T_world_robot must be finite where",
+    "an image before the state": "state must be a SlamState, not Segments",
+    "a negative noise of the motion": "MotionModel.turn_noise must be a number from 0 on, not -0.1",
+    "a gate that is not a number": "Association.gate must be a number from 0 on, not nan",
+    "a choice that is none": "FilterConfig.choice must be 'resample' or 'winner', not 'winer'",
     "an int as key": "key must be a jax.random.key(...), not a int",
     "camera before settings": "SofSlam(config, camera, mount): config must be a SlamConfig, not a",
 }

@@ -35,7 +35,7 @@ from sofjax.segment_map import (
 pytestmark = pytest.mark.usefixtures("x64")
 
 
-def test_a_off_floor_line_does_not_join_the_floor_line_below_it():
+def test_an_off_floor_line_does_not_join_the_floor_line_below_it():
     m, ends = doubled(KALMAN)
     off_floor = dataclasses.replace(
         m,
@@ -75,7 +75,7 @@ def test_the_height_of_a_line_is_found_from_all_its_views(z):
     np.testing.assert_allclose(ends_of(m)[:, 1], 1.0, atol=2e-3)
 
 
-def test_a_off_floor_line_grows_to_where_it_ends_and_not_to_where_it_appears_to():
+def test_an_off_floor_line_grows_to_where_it_ends_and_not_to_where_it_appears_to():
     m, T = drive_past(0.1), pose(*PATH[-1])
     apparent = off_floor_view(T, 1.0, 0.1, 1.0, 4.2)
     m = seen(m, apparent, at=T, slots=[0], rules=KALMAN, sigma=0.005)
@@ -117,7 +117,7 @@ def test_a_line_taken_for_floor_is_conditioned_on_its_height(rng):
     np.testing.assert_allclose(left[2], 0, atol=1e-12)
 
 
-def test_a_off_floor_line_is_taken_as_it_is():
+def test_an_off_floor_line_is_taken_as_it_is():
     line, covariance = jnp.array([1.0, 0.2, 1.3]), jnp.diag(jnp.array([0.1, 0.1, 1e-4]))
     assert_bitwise_equal(posterior_given_class(KALMAN, line, covariance), (line, covariance))
 

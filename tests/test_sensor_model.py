@@ -80,6 +80,11 @@ def test_a_pose_is_scored_as_a_step_weights_its_particles():
     one = pose_log_likelihood(slam, state, segments, estimate)
     assert one.shape == () and one == pytest.approx(float(many[0]), abs=0.5)
 
+    turned = pose_log_likelihood(
+        slam, state, segments, SE2(poses.xy, poses.yaw.at[1].add(2 * np.pi))
+    )
+    np.testing.assert_allclose(turned, many, rtol=1e-3, atol=0.05)
+
     def of_height(height):
         at = dataclasses.replace(slam, mount=dataclasses.replace(MOUNT, height=height))
         return pose_log_likelihood(at, state, segments, estimate)

@@ -27,7 +27,7 @@ def among(n, *excluding):
 
 
 def test_what_fits_alone_is_refused_where_all_else_has_drifted():
-    d, S = drifted([0.081, 0.001, 0.078, 0.083, 0.08])  # the second: a nadir and a top 8 cm apart
+    d, S = drifted([0.081, 0.001, 0.078, 0.083, 0.08])  # the second: a baseboard's edges, 8 cm
     assert set(compatible(d, S, among(5))) == {0, 2, 3, 4}
     assert compatible(d[1:2], S[1:2, :, 1:2], among(1)) == [0]
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sofjax._checks import check_fields
 from sofjax.geometry.camera import Camera
 from sofjax.geometry.lines import line_through, polar, polar_differences, transfer_line
 from sofjax.geometry.segments import Segments, overlap
@@ -20,6 +21,13 @@ class Association(eqx.Module):
     temperature: float = 1.0  # of the gate of the soft filter, in units of epsilon
     baseline_distance: float = 0.15  # metres between the two views, or ...
     baseline_angle: float = 0.15  # ... radians, whichever comes first
+
+    def __check_init__(self) -> None:
+        check_fields(
+            self,
+            positive=("temperature",),
+            at_least_zero=("alpha", "beta", "gate", "baseline_distance", "baseline_angle"),
+        )
 
 
 class Matches(eqx.Module):

@@ -5,12 +5,12 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sofjax._pytree import in_double
 from sofjax.calibration import TURNS, UNKNOWNS, DriveFit, DriveFitConfig, FitConfig, fit_drive
 from sofjax.calibration.assessment import doubts, estimates
 from sofjax.calibration.joint import fit_jointly
@@ -29,8 +29,6 @@ MOUNT, ODOMETER = UNKNOWNS[:4], UNKNOWNS[4:]
 BY_DEFAULT = ("height", "pitch", "roll")
 STANDS_STILL = 0.05  # metres and radians, below which a drive tells nothing of a mount
 FRONTEND = FrontendSettings()
-
-Tree = TypeVar("Tree")
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ def calibrate_drive(
     # the odometer's turning errs more than anything; its distance is the measure of the height
     config = DriveFitConfig(fit=FitConfig(free=tuple(dict.fromkeys([*free, *TURNS]))))
     with jax.enable_x64(True):
-        camera, mount, log = _in_float64((drive.camera_file.camera, drive.camera_file.mount, log))
+        camera, mount, log = in_double((drive.camera_file.camera, drive.camera_file.mount, log))
         found = fit_drive(camera, mount, log, config)
         assessment = found.verdict(config)
         usable = assessment.usable
@@ -162,16 +160,6 @@ def _check_moves(drive: Drive) -> None:
             f"{math.degrees(turned):.1f}° in all; a mount can only be fitted to a drive of some "
             "metres"
         )
-
-
-def _in_float64(tree: Tree) -> Tree:
-    """The same arrays, floats in float64; wants `enable_x64`."""
-
-    def double(leaf: jax.Array | np.ndarray) -> jax.Array:
-        leaf = np.asarray(leaf)
-        return jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
-
-    return jax.tree.map(double, tree)
 
 
 def _jointly(

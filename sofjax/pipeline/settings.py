@@ -8,9 +8,9 @@ from pathlib import Path
 from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.io.settings import INLINE, Setting, read_toml, to_dict, with_settings
 from sofjax.pipeline.outcomes import LOOPS
-from sofjax.segment_map import MapConfig
+from sofjax.segment_map.types import MAP_RULES, MapConfig
 from sofjax.slam import presets
-from sofjax.slam.config import SlamConfig
+from sofjax.slam.config import FILTER_CHOICES, SlamConfig
 from sofjax.vision import DETECTORS, FrontendSettings
 
 FRONTEND = FrontendSettings()
@@ -18,8 +18,8 @@ RECALL = 150  # images: the paper's closing is of a filter that does not find it
 
 CHOICES = {
     "loop": LOOPS,
-    "filter.choice": ("resample", "winner"),
-    "segment_map.rule": ("kalman", "gamma"),
+    "filter.choice": FILTER_CHOICES,
+    "segment_map.rule": MAP_RULES,
 }
 LIMITS = {
     "seed": (0, 2**32 - 1),
@@ -37,7 +37,7 @@ LIMITS = {
 class RunSettings:
     """All that decides what a run writes, beside the drive. Refuses what no run can use."""
 
-    seed: int = 0
+    seed: int = 0  # of the filter's random numbers
     frontend: FrontendSettings = FRONTEND
     slam: SlamConfig = dataclasses.field(default=presets.DEFAULT, metadata=INLINE)
     loop: str = "smooth"  # after the drive: "none", the "paper"'s closing, or "smooth"

@@ -9,6 +9,8 @@ from sofjax._checks import check_fields
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 
+MAP_RULES = ("kalman", "gamma")
+
 
 class MapConfig(eqx.Module):
     """How the map grows; the paper's R and L, and what goes past it."""
@@ -43,7 +45,7 @@ class MapConfig(eqx.Module):
     def __check_init__(self) -> None:
         check_fields(
             self,
-            choices={"rule": ("kalman", "gamma")},
+            choices={"rule": MAP_RULES},
             whole_from={"capacity": 1, "nearby": 1, "candidates": 1},
             positive=("range", "length", "scale_sigma", "scale_above", "scale_below"),
             at_least_zero=(

@@ -9,7 +9,7 @@ from sofjax.likelihood.sensor_model import SensorModel
 from sofjax.motion import MotionModel
 from sofjax.segment_map import MapConfig
 
-CHOICES = ("resample", "winner")
+FILTER_CHOICES = ("resample", "winner")
 
 
 class FilterConfig(eqx.Module):
@@ -27,7 +27,7 @@ class FilterConfig(eqx.Module):
     def __check_init__(self) -> None:
         check_fields(
             self,
-            choices={"choice": CHOICES},
+            choices={"choice": FILTER_CHOICES},
             whole_from={"particles": 1},
             at_least_zero=("effective_share",),
             positive=("max_depth",),

@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sofjax.geometry.angles import wrap
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
+from sofjax.likelihood.batch.arguments import check_poses, check_segments, check_type
 from sofjax.likelihood.measurements import measure
 from sofjax.likelihood.tracking import pixels_and_weight
 from sofjax.slam.config import Setup
@@ -13,7 +15,6 @@ from sofjax.slam.reweight import hard_log_likelihood, local_map
 from sofjax.slam.state import SlamState
 
 
-@jax.jit
 def pose_log_likelihood(
     slam: Setup, state: SlamState, segments_image: Segments, T_world_robot: SE2
 ) -> Float[Array, "*poses"]:
@@ -29,10 +30,25 @@ def pose_log_likelihood(
     - `segments_image`: M segments, pixels of the undistorted image.
     - `T_world_robot`: poses [*poses], metres and radians.
 
-    **Returns:** log L without constants; 0 where the image shows no segment of the floor.
+    **Returns:** log L without constants; 0 where the image shows no segment of the floor. A
+    ValueError names an argument that cannot be used.
     """
+    check_type("slam", slam, Setup, "a SofSlam")
+    check_type("state", state, SlamState, "a SlamState")
+    check_segments("segments_image", segments_image)
+    check_poses("T_world_robot", T_world_robot)
+    if not T_world_robot.yaw.size:
+        return jnp.zeros(T_world_robot.yaw.shape)
+    return _pose_log_likelihood(slam, state, segments_image, T_world_robot)
+
+
+@jax.jit
+def _pose_log_likelihood(
+    slam: Setup, state: SlamState, segments_image: Segments, T_world_robot: SE2
+) -> Float[Array, "*poses"]:
     poses = T_world_robot.yaw.shape
     xy, yaw = T_world_robot.xy.reshape(-1, 2), T_world_robot.yaw.reshape(-1)
+    yaw = yaw[0] + wrap(yaw - yaw[0])  # a whole turn more is the same pose
     mean = jax.lax.stop_gradient(SE2(xy.mean(axis=0), yaw.mean()))
     config = slam.config
     variance, weight = pixels_and_weight(config.sensor, state.variance_inflation)

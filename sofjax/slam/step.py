@@ -16,22 +16,22 @@ from sofjax.slam.state import SlamState, StepInfo, initial_state
 
 
 def one_round(
-    slam: Setup, state: SlamState, observation: Observation
+    setup: Setup, state: SlamState, observation: Observation
 ) -> tuple[SlamState, StepInfo, Mapped]:
     """One round of Fig. 6."""
     key, key_motion, key_slip, key_choice = jax.random.split(state.key, 4)
     # 1-3) move, and sample N particles by the motion model
-    predicted = predict(slam, state, observation, key_motion, key_slip)
+    predicted = predict(setup, state, observation, key_motion, key_slip)
     # 4) put the segments on the floor, and extract SoF (Fig. 5) against a view a baseline away
-    extracted = extract_sof(slam, state, observation, predicted)
+    extracted = extract_sof(setup, state, observation, predicted)
     # 5) compare with the map by the sensor model, and choose
-    local = local_map(slam, state.segment_map, extracted.measurements, predicted.T_world_robot)
-    weighted = reweight(slam, predicted, extracted, local)
-    chosen = choose(slam, predicted, extracted, local, weighted, key_choice)
+    local = local_map(setup, state.segment_map, extracted.measurements, predicted.T_world_robot)
+    weighted = reweight(setup, predicted, extracted, local)
+    chosen = choose(setup, predicted, extracted, local, weighted, key_choice)
     # 6) integrate the observed segments into the map, as seen from the chosen pose
-    updated = update_map(slam, state.segment_map, extracted, local, chosen)
+    updated = update_map(setup, state.segment_map, extracted, local, chosen)
     # 7) the next round starts from here
-    after, info = advance(slam, state, extracted, local, weighted, chosen, updated, key)
+    after, info = advance(setup, state, extracted, local, weighted, chosen, updated, key)
     return after, info, Mapped(extracted.measurements, updated.new_slots)
 
 

@@ -119,7 +119,7 @@ def smooth(
     log = without_unread_motions(log)
     with jax.enable_x64(True):
         given = config, camera, mount, log, path, segment_map, rules, priors
-        config, camera, mount, log, path, segment_map, rules, priors = map(in_double, given)
+        config, camera, mount, log, path, segment_map, rules, priors = in_double(given)
         index = kf.choose(path.T_world_robot, float(rules.step * mount.height), float(rules.turn))
         frames = kf.gather(log, index, rules.room)
         lines = _lines_of_map(config.segment_map, segment_map, rules)

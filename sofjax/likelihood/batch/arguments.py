@@ -13,7 +13,7 @@ from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
 from sofjax.likelihood.sensor_model import LineNoise
 
-FAR = 1000.0  # metres from the robot at which no segment of a floor is seen: these are pixels
+FAR = 200.0  # metres from the robot at which no segment of a floor is seen: these are pixels
 NEAR = 4.0  # pixels within which no image lies: these are metres
 
 
@@ -30,17 +30,15 @@ def check_problem(
     **Returns:** the noise as arrays of the particles' type, so that a new value is not a new
     program.
     """
-    _check_type("particles", particles, SE2, "poses SE2(xy [N, 2], yaw [N])")
-    _check_segments("observed", observed)
-    _check_segments("segment_map", segment_map)
-    _check_type("noise", noise, LineNoise, "a LineNoise(rho_sigma, theta_sigma, e_max)")
-    _check_floats("particles", (particles.xy, particles.yaw))
+    check_poses("particles", particles)
+    check_segments("observed", observed)
+    check_segments("segment_map", segment_map)
+    check_type("noise", noise, LineNoise, "a LineNoise(rho_sigma, theta_sigma, e_max)")
     if particles.xy.ndim != 2 or particles.yaw.ndim != 1:
         raise ValueError(
             f"particles must be N poses, xy [N, 2] and yaw [N], not xy {particles.xy.shape}; "
             "for one pose use pose.xy[None] and pose.yaw[None], and for more axes jax.vmap"
         )
-    _check_finite("particles", np.asarray(True), particles.xy, particles.yaw)
     ends = value_of(observed.endpoints)
     if ends is not None and np.abs(_valid(ends, observed)).max(initial=0) > FAR:
         raise ValueError(
@@ -59,9 +57,9 @@ def check_problem(
 
 def check_image(camera: Camera, mount: Mount, segments_image: Segments) -> None:
     """Refuse what `image_log_likelihood` cannot use."""
-    _check_type("camera", camera, Camera, "a Camera")
-    _check_type("mount", mount, Mount, "a Mount")
-    _check_segments("segments_image", segments_image)
+    check_type("camera", camera, Camera, "a Camera")
+    check_type("mount", mount, Mount, "a Mount")
+    check_segments("segments_image", segments_image)
     ends = value_of(segments_image.endpoints)
     if ends is not None:
         ends = np.abs(_valid(ends, segments_image))
@@ -72,12 +70,21 @@ def check_image(camera: Camera, mount: Mount, segments_image: Segments) -> None:
             )
 
 
-def _check_type(name: str, given: Any, kind: type, right: str) -> None:
+def check_poses(name: str, given: Any) -> None:
+    """Refuse what is no poses, or poses that are not finite floating point numbers."""
+    check_type(name, given, SE2, "poses SE2(xy [N, 2], yaw [N])")
+    _check_floats(name, (given.xy, given.yaw))
+    _check_finite(name, np.asarray(True), given.xy.reshape(-1, 2), given.yaw.reshape(-1))
+
+
+def check_type(name: str, given: Any, kind: type, right: str) -> None:
+    """Refuse what is of another type."""
     if not isinstance(given, kind):
         raise ValueError(f"{name} must be {right}, not {type(given).__name__}")
 
 
-def _check_segments(name: str, given: Any) -> None:
+def check_segments(name: str, given: Any) -> None:
+    """Refuse what is no row of segments, or has ends that are not finite where it is valid."""
     right = "Segments(endpoints [K, 2, 2], valid [K])"
     if not isinstance(given, Segments):
         also = "; Segments.of(array) makes it of end points" if hasattr(given, "shape") else ""

@@ -28,11 +28,10 @@ def duplicates(
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each line another that was seen more and is the same, if there is one.
 
-    Two are compared where the line itself is, with the covariance of their difference: two edges
-    that were seen side by side are known well against each other and stay two; what was seen again
-    after a long way is known badly against what was seen first, and all that was seen there tells
-    together which are one (`compatible`). What may as well be one line as another that is not the
-    same is left for later, when more is known.
+    Two are compared where the line itself is, with the covariance of their difference. Two edges
+    that were seen side by side are well known relative to each other and stay two. A revisited line
+    is badly known relative to its first description, so all candidate pairs of a place are tested
+    jointly (`compatible`). A line that fits two others equally well is left until more is known.
 
     **Returns:** [K] the other's index, and whether there is one.
     """

@@ -30,8 +30,8 @@ class Lines(eqx.Module):
     def endpoints_world(self) -> Float[Array, "K 2 2"]:
         """End points, at the lines' true places: the apparent scale magnifies rho."""
         polar = PolarLine(self.line[:, 0] / self.line[:, 2], self.line[:, 1])
-        nadir = normal(polar) * polar.rho[:, None]
-        ends = nadir[:, None] + self.reach[..., None] * direction(polar)[:, None]
+        foot = normal(polar) * polar.rho[:, None]  # of the perpendicular from the anchor
+        ends = foot[:, None] + self.reach[..., None] * direction(polar)[:, None]
         return jax.vmap(lambda T, e: T.apply(e))(self.anchor, ends)
 
 

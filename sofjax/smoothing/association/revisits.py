@@ -16,10 +16,10 @@ BENT = 2.0  # times the pixels' standard deviation: root mean square that no one
 def apart(
     problem: Problem, lines: Lines, passing: float, least: int, room: int
 ) -> tuple[Problem, Lines]:
-    """What is seen again after a way is another line until it is found to be one.
+    """Lines split by revisit: one that is seen again starts a new line until the two are merged.
 
-    Where a drive has drifted by as much as two edges are apart, as the nadir and the top of a
-    baseboard, each is taken for the other and so are all beside them: no solution leads back.
+    The drift may be as large as the gap between two edges, such as bottom and top of a baseboard.
+    Each is then taken for the other, and so are all beside them: no solution leads back.
 
     **Arguments:**
     - `passing`: metres driven after which a revisit starts a new line until it is merged.
@@ -69,7 +69,7 @@ def apart(
 
 
 def renamed(problem: Problem, lines: Lines, name: Int[np.ndarray, "K"]) -> tuple[Problem, Lines]:
-    """Lines that are one go on as one: their segments show it, and its reach is that of all."""
+    """Merged lines: their segments show the one that remains, within the spans of all."""
     line, (first, last) = problem.keyframes.line, lines.span.T
     span = jnp.stack([first.at[name].min(first), last.at[name].max(last)], axis=1)
     valid = lines.valid & (name == np.arange(len(name)))
@@ -79,8 +79,8 @@ def renamed(problem: Problem, lines: Lines, name: Int[np.ndarray, "K"]) -> tuple
 
 
 def without_bent(problem: Problem, lines: Lines) -> tuple[Problem, Lines, Bool[Array, ""]]:
-    """Without lines that misfit what was seen of them by much more than pixels may, which no one
-    line has shown; and whether there were any.
+    """Without lines whose residuals are far above the pixels' noise: no one line has shown those
+    segments. And whether there were any.
     """
     frames, K = problem.keyframes, lines.valid.shape[0]
     count = measurements(frames, lines)
