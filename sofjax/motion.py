@@ -15,7 +15,13 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
 
 UNREAD = (0.3, 0.3, 0.3)  # metres and radians, standard deviation of a motion that is not a number
-BIAS = ("distance", "left", "right", "curvature")  # names of the systematic errors b
+BIAS: tuple[str, ...] = (
+    "distance",
+    "left",
+    "right",
+    "curvature",
+)  # names of the systematic errors b
+MEANS = ("distance_error", "left_error", "right_error", "curvature")  # settings: their prior means
 
 
 class MotionModel(eqx.Module):
@@ -32,13 +38,18 @@ class MotionModel(eqx.Module):
     distance_scale_sigma: float = 0.01  # prior of the relative error of distances
     turn_scale_sigma: float = 0.05  # prior of the relative errors of left and of right turns
     curvature_sigma: float = 0.005  # radians per metre, prior of the pull to one side
+    distance_error: float = 0.0  # prior means of the systematic errors b: shares, ...
+    left_error: float = 0.0
+    right_error: float = 0.0
+    curvature: float = 0.0  # ... and radians per metre; as a calibration knows them
     bias_drift: float = 0.02  # share of its prior that a systematic error wanders in sqrt(metre)
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip
     slip_turn: float = 0.05  # radians, standard deviation of a slip
 
     def __check_init__(self) -> None:
-        check_fields(self, at_least_zero=tuple(field.name for field in dataclasses.fields(self)))
+        names = {field.name for field in dataclasses.fields(self)} - set(MEANS)
+        check_fields(self, at_least_zero=tuple(sorted(names)))
 
 
 class OdometerBias(eqx.Module):
@@ -53,7 +64,10 @@ class OdometerBias(eqx.Module):
 
 
 def prior_bias(model: MotionModel) -> OdometerBias:
-    return OdometerBias(jnp.zeros(4), jnp.diag(_prior_sigma(model) ** 2))
+    return OdometerBias(
+        jnp.stack([jnp.asarray(getattr(model, name), float) for name in MEANS]),
+        jnp.diag(_prior_sigma(model) ** 2),
+    )
 
 
 def _prior_sigma(model: MotionModel) -> Float[Array, "4"]:

@@ -11,10 +11,10 @@ import pytest
 
 from sofjax.calibration import UNKNOWNS
 from sofjax.cli import main
-from sofjax.cli.arguments import FREE
-from sofjax.cli.calibrate_mount import free_names
+from sofjax.cli.calibrate_robot import free_names
 from sofjax.geometry import Mount
 from sofjax.io.camera_file import read_camera
+from sofjax.pipeline.outcomes import FREE
 from sofjax.vision import rectify
 
 OFFICE = Path(__file__).parent.parent / "examples" / "office"

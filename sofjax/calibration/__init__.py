@@ -1,17 +1,19 @@
-"""Where the camera sits on the robot, from what it sees while driving."""
+"""What camera, mount, clock and odometer are, from what is seen while driving."""
 
 from sofjax.calibration.assessment import Assessment as Assessment
 from sofjax.calibration.assessment import FitOutcome as FitOutcome
 from sofjax.calibration.fit import CalibrationResult as CalibrationResult
 from sofjax.calibration.fit import FitConfig as FitConfig
-from sofjax.calibration.fit import fit_mount as fit_mount
+from sofjax.calibration.fit import fit_rig as fit_rig
 from sofjax.calibration.fit_drive import DriveFit as DriveFit
 from sofjax.calibration.fit_drive import DriveFitConfig as DriveFitConfig
 from sofjax.calibration.fit_drive import fit_drive as fit_drive
+from sofjax.calibration.pairs import MOUNT as MOUNT
 from sofjax.calibration.pairs import TURNS as TURNS
 from sofjax.calibration.pairs import UNKNOWNS as UNKNOWNS
 from sofjax.calibration.pairs import Estimate as Estimate
 from sofjax.calibration.pairs import PairNoise as PairNoise
+from sofjax.calibration.pairs import Seen as Seen
 from sofjax.calibration.pairs import SegmentPairs as SegmentPairs
 from sofjax.calibration.pairs import distances as distances
 from sofjax.calibration.pairs import expected as expected

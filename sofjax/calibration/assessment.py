@@ -1,4 +1,4 @@
-"""Whether a fit of the mount is an answer, and what it says, in words for a person."""
+"""Whether a fit of the rig is an answer, and what it says, in words for a person."""
 
 import enum
 from dataclasses import dataclass
@@ -9,8 +9,9 @@ import optimistix as optx
 from jaxtyping import Float
 
 from sofjax.calibration.fit import DEFAULT, CalibrationResult, FitConfig
-from sofjax.calibration.pairs import TURNS, UNKNOWNS, SegmentPairs
-from sofjax.geometry.camera import Mount
+from sofjax.calibration.pairs import MOUNT, TURNS, UNKNOWNS, SegmentPairs
+from sofjax.motion import BIAS
+from sofjax.rig import Rig
 
 SCALE = (
     "only the height over the odometer's distances can be seen: an odometer that reads 1 % too "
@@ -22,19 +23,34 @@ _HINT = (
     "path; to see pitch and roll, drive towards such lines until they are near"
 )
 
-_ODOMETER_ERRORS = {
-    "distance": "odometer's error in distance",
-    "left": "odometer's error in left turns",
-    "right": "odometer's error in right turns",
-    "curvature": "odometer's pull to one side",
+_DEGREES = ("pitch", "roll", "yaw")
+# of each unknown: its name in a sentence, what a unit of the fit is in the unit shown, that unit
+_SHOWN = {
+    "height": ("height", 100.0, "%"),
+    **{name: (name, 180 / np.pi, "°") for name in _DEGREES},
+    "x": ("lever arm ahead", 100.0, "% of the height"),
+    "y": ("lever arm to the left", 100.0, "% of the height"),
+    "focal": ("focal length", 100.0, "%"),
+    "cx": ("centre to the right", 100.0, "% of the focal length"),
+    "cy": ("centre downwards", 100.0, "% of the focal length"),
+    "k1": ("lens's k1", 1.0, ""),
+    "k2": ("lens's k2", 1.0, ""),
+    "time_offset": ("time offset", 1e3, "ms"),
+    "line_delay": ("line delay", 1e6, "µs"),
+    "distance": ("odometer's error in distance", 100.0, "%"),
+    "left": ("odometer's error in left turns", 100.0, "%"),
+    "right": ("odometer's error in right turns", 100.0, "%"),
+    "curvature": ("odometer's pull to one side", 180 / np.pi, "° a metre"),
 }
-
 _ODOMETER = (
     ("distances", "%"),
     ("left turns", "%"),
     ("right turns", "%"),
     ("turned to the left", "rad / 100 m"),
 )
+# what a mount must be known to, share of the height and radians, to be called so
+GOOD = (0.02, np.radians(0.2))
+ROUGH = (0.05, np.radians(0.5))
 
 
 class FitOutcome(enum.Enum):
@@ -72,9 +88,9 @@ def assess(found: CalibrationResult, config: FitConfig, pairs: SegmentPairs) -> 
     count = int(pairs.valid.sum())
     if count < config.min_pairs:
         return Assessment.of(FitOutcome.TOO_FEW_PAIRS, count=count, needed=config.min_pairs)
-    sigma = jnp.sqrt(jnp.diag(found.covariance)).at[0].divide(found.mount.height)
+    sigma = jnp.sqrt(jnp.diag(found.covariance))
     wide = [
-        f"the {_ODOMETER_ERRORS.get(name, name)} ({_accuracy(name, float(s))})"
+        f"the {_SHOWN[name][0]} (known to {_shown(name, float(s))})"
         for name, s, limit in zip(UNKNOWNS, sigma, config.limit, strict=True)
         # the errors in turning are always free: nobody asked for them
         if name in config.free and name not in TURNS and s > limit
@@ -115,42 +131,67 @@ def doubts(found: CalibrationResult, config: FitConfig = DEFAULT) -> str:
     )
 
 
+def grade(covariance: Float[np.ndarray, "17 17"]) -> str:
+    """good, rough or not usable, by how well height and angles are known."""
+    sigma = np.sqrt(np.diag(covariance))[:3]
+    for word, (height, angle) in (("good", GOOD), ("rough", ROUGH)):
+        if (sigma <= (height, angle, angle)).all():
+            return word
+    return "not usable"
+
+
+def accuracy(covariance: Float[np.ndarray, "17 17"], free: tuple[str, ...]) -> str:
+    """How well each of height, pitch and roll is known, if it was free."""
+    sigma = np.sqrt(np.diag(covariance))
+    known = [f"{name} to {_shown(name, sigma[i])}" for i, name in enumerate(MOUNT[:3])
+             if name in free and sigma[i]]  # fmt: skip
+    return "known " + ", ".join(known) + ", apart from the odometer's scale"
+
+
 def estimates(
-    mount: Mount,
+    rig: Rig,
     odometer: Float[np.ndarray, "4"],
-    covariance: Float[np.ndarray, "8 8"],
+    covariance: Float[np.ndarray, "17 17"],
     free: tuple[str, ...],
 ) -> list[str]:
     """What was fitted, each with its standard deviation, and the correlations, as lines of text."""
-    sigma = np.sqrt(np.diag(covariance))
+    sigma = dict(zip(UNKNOWNS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    m, k = rig.mount, rig.lens.coefficients
+    h, f = float(m.height), float(rig.camera.K[0, 0])
+    values = {
+        "height": (h, h, "m", 4), "x": (m.x, h, "m", 4), "y": (m.y, h, "m", 4),
+        **{name: (np.degrees(getattr(m, name)), 180 / np.pi, "°", 2) for name in _DEGREES},
+        "focal": (f, f, "px", 2), "cx": (rig.camera.K[0, 2], f, "px", 2),
+        "cy": (rig.camera.K[1, 2], f, "px", 2), "k1": (k[0], 1.0, "", 4), "k2": (k[1], 1.0, "", 4),
+        "time_offset": (1e3 * rig.time_offset, 1e3, "ms", 1),
+        "line_delay": (1e6 * rig.line_delay, 1e6, "µs", 1),
+    }  # fmt: skip
     lines = []
-    for i, name in enumerate(UNKNOWNS[:4]):
+    for name, (value, unit, word, digits) in values.items():
         if name not in free:
             continue
-        if name == "height":
-            lines.append(f"height    {float(mount.height):.4f} ± {sigma[i]:.4f} m")
-        else:
-            value, s = np.degrees([float(getattr(mount, name)), sigma[i]])
-            lines.append(f"{name:9} {value:.2f} ± {s:.2f}° ({float(getattr(mount, name)):.4f} rad)")
+        space = "" if word in ("°", "") else " "
+        line = f"{name:9} {float(value):.{digits}f} ± {unit * sigma[name]:.{digits}f}{space}{word}"
+        radians = f" ({float(getattr(m, name)):.4f} rad)" if name in _DEGREES else ""
+        lines.append(line + radians)
     more = [
-        f"{words} {100 * float(odometer[i]):+.2f} ± {100 * sigma[4 + i]:.2f} {unit}"
+        f"{words} {100 * float(odometer[i]):+.2f} ± {100 * sigma[BIAS[i]]:.2f} {unit}"
         for i, (words, unit) in enumerate(_ODOMETER)
-        if UNKNOWNS[4 + i] in free
+        if BIAS[i] in free
     ]
     lines += [f"odometer  its readings are to be changed: {', '.join(more)}"] * bool(more)
-    shown = [i for i, name in enumerate(UNKNOWNS[:4]) if name in free and sigma[i] > 0]
+    shown = [i for i, name in enumerate(UNKNOWNS) if name in MOUNT and name in free and sigma[name]]
     correlations = [
-        f"{UNKNOWNS[i]} and {UNKNOWNS[j]} {covariance[i, j] / sigma[i] / sigma[j]:+.2f}"
+        f"{UNKNOWNS[i]} and {UNKNOWNS[j]} "
+        f"{covariance[i, j] / sigma[UNKNOWNS[i]] / sigma[UNKNOWNS[j]]:+.2f}"
         for n, i in enumerate(shown)
         for j in shown[n + 1 :]
     ]
     return lines + [f"correlation  {', '.join(correlations)}"] * bool(correlations)
 
 
-def _accuracy(name: str, sigma: float) -> str:
-    """How well an unknown is known, with its unit."""
-    if name in ("height", "distance", "left", "right"):
-        return f"known to {100 * sigma:.2g} %"
-    if name == "curvature":
-        return f"known to {sigma * 57.29578:.2g}° a metre"
-    return f"known to {sigma * 57.29578:.2g}°"
+def _shown(name: str, value: float) -> str:
+    """A value in the unit that a person reads, with the unit."""
+    _, unit, word = _SHOWN[name]
+    space = "" if word[:1] in ("°", "") else " "
+    return f"{unit * value:.2g}{space}{word}"

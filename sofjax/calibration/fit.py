@@ -1,4 +1,4 @@
-"""The mount by least squares over pairs, with its covariance and what the pairs do not show."""
+"""The rig by least squares over pairs, with its covariance and what the pairs do not show."""
 
 from collections.abc import Callable
 
@@ -12,27 +12,40 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sofjax._checks import check_fields
 from sofjax.calibration.pairs import (
+    MOUNT,
+    ODOMETER,
     UNKNOWNS,
+    Estimate,
+    Seen,
     SegmentPairs,
     U,
     all_distances,
-    start_at,
+    distances,
+    seen_near,
 )
-from sofjax.geometry.camera import Camera, Mount
+from sofjax.geometry.camera import Mount
 from sofjax.smoothing.problem import robust
 
-MOUNT = ("height", "pitch", "roll")  # what is free by default
+# standard deviations of what is known beforehand of each of UNKNOWNS, in the units of `RIG` and of
+# the odometer's errors, and those from which on an answer is none
+PRIOR = dict(
+    height=3.0, pitch=1.0, roll=1.0, yaw=1.0, x=0.5, y=0.5, focal=0.1, cx=0.03, cy=0.03, k1=0.1,
+    k2=0.1, time_offset=0.2, line_delay=5e-5, distance=0.01, left=0.05, right=0.05, curvature=0.005,
+)  # fmt: skip
+LIMIT = dict(
+    height=0.05, pitch=0.0088, roll=0.0088, yaw=0.0088, x=0.1, y=0.1, focal=0.01, cx=0.01, cy=0.01,
+    k1=0.02, k2=0.02, time_offset=0.01, line_delay=1e-5, distance=0.05, left=0.1, right=0.1,
+    curvature=0.01,
+)  # fmt: skip
 
 
 class FitConfig(eqx.Module):
     """What is free, what is known beforehand, and how well an answer must be known."""
 
-    free: tuple[str, ...] = eqx.field(static=True, default=MOUNT)  # of UNKNOWNS
-    # standard deviations: log height; pitch, roll, yaw in radians; the odometer's errors
-    prior_sigma: tuple[float, ...] = (3.0, 1.0, 1.0, 1.0, 0.02, 0.05, 0.05, 0.005)
+    free: tuple[str, ...] = eqx.field(static=True, default=MOUNT[:3])  # of UNKNOWNS
+    prior_sigma: tuple[float, ...] = tuple(PRIOR.values())  # of each of UNKNOWNS
     loss_scale: float = 2.0  # residuals, in sigmas, from which they count linearly only
-    # the largest standard deviations of an answer, in the units of `prior_sigma`
-    limit: tuple[float, ...] = (0.05, 0.02, 0.02, 0.02, 0.05, 0.1, 0.1, 0.01)
+    limit: tuple[float, ...] = tuple(LIMIT.values())  # the largest standard deviations of an answer
     pixel_sigma: float = 0.5  # pixels: jitter whose information does not count, see `_sandwich`
     min_pairs: int = 20
     # a larger Birge ratio is a doubt; three odometer errors exceed it by chance in 1 of 140 drives
@@ -57,20 +70,18 @@ class FitConfig(eqx.Module):
 
 
 DEFAULT = FitConfig()
-ODOMETER = slice(4, None)  # of UNKNOWNS
 
 
 class CalibrationResult(eqx.Module):
-    """A fitted mount, and how well it is known."""
+    """A fitted rig, and how well it is known."""
 
-    mount: Mount
-    odometer: Float[Array, "4"]  # its systematic errors b, see `MotionModel`; 0 where not free
-    covariance: Float[Array, "8 8"]  # of UNKNOWNS, in metres, radians and shares; 0 if not free
+    estimate: Estimate  # what is not free stays as it was
+    covariance: Float[Array, "17 17"]  # of `estimate.by`; 0 if not free
     residuals: Float[Array, "N 4"]  # pixels; 0 where a pair is not valid
-    observable: Bool[Array, "8"]  # whether each of UNKNOWNS was free and the pairs fix it
+    observable: Bool[Array, "17"]  # whether each of UNKNOWNS was free and the pairs fix it
     # the direction that is known least: a unit vector in shares of `limit`, and its standard
     # deviation in the same shares; above 1 the fit is no answer
-    weakest: Float[Array, "8"]
+    weakest: Float[Array, "17"]
     weakest_sigma: Float[Array, ""]
     # RMS of the odometer's errors over their priors, in sigmas, at least 1; the covariance is
     # multiplied by its square
@@ -78,38 +89,43 @@ class CalibrationResult(eqx.Module):
     cost: Float[Array, ""]  # half the sum of robust squares, in sigmas
     result: optx.RESULTS  # of the solver; an estimate that did not converge is the best so far
 
+    @property
+    def mount(self) -> Mount:
+        return self.estimate.rig.mount
+
+    @property
+    def odometer(self) -> Float[Array, "4"]:
+        """Its systematic errors b, see `MotionModel`; 0 where not free."""
+        return self.estimate.bias
+
 
 class _Terms(eqx.Module):
     """What `_fit` takes of its settings, as arrays: one compiled program for all of them."""
 
-    is_free: Bool[Array, "8"]
-    prior_sigma: Float[Array, "8"]
-    limit: Float[Array, "8"]
+    is_free: Bool[Array, "17"]
+    prior_sigma: Float[Array, "17"]
+    limit: Float[Array, "17"]
     loss_scale: Float[Array, ""]
     min_pairs: Int[Array, ""]
     pixel_sigma: Float[Array, ""]
 
 
-Residuals = Callable[[Float[Array, "8"], SegmentPairs], Float[Array, "N 4"]]
+Residuals = Callable[[Float[Array, "17"], Seen], Float[Array, "N 4"]]
 
 
-def fit_mount(
-    camera: Camera,
-    mount: Mount,
-    pairs: SegmentPairs,
-    config: FitConfig = DEFAULT,
-    max_steps: int = 60,
+def fit_rig(
+    start: Estimate, pairs: SegmentPairs, config: FitConfig = DEFAULT, max_steps: int = 60
 ) -> CalibrationResult:
-    """The mount that carries the floor's lines from image to image; Levenberg-Marquardt.
+    """The rig that carries the floor's lines from image to image; Levenberg-Marquardt.
 
     Pure; `jax.vmap` runs it over logs and over starts, and its estimate has derivatives by all of
-    `camera`, `pairs` and the mount's lever arm, by the implicit function theorem. Wants float64.
+    `start.given` and `pairs`, by the implicit function theorem. Wants float64.
 
     Only the ratio of the height to the odometer's scale of distance is observable. With 'distance'
     free too, the priors decide how the two share it.
 
     **Arguments:**
-    - `mount`: where to begin, and the mean of the priors; what is not free stays as it is.
+    - `start`: where to begin; the priors are about `start.given`, and what is not free stays.
     - `pairs`: associations and sigmas, which stay as they are.
     """
     terms = _Terms(
@@ -120,49 +136,51 @@ def fit_mount(
         min_pairs=jnp.asarray(config.min_pairs),
         pixel_sigma=jnp.asarray(config.pixel_sigma),
     )
-    return _fit(camera, mount, pairs, terms, max_steps)
+    return _fit(start, pairs, terms, max_steps)
 
 
 @eqx.filter_jit  # one program, whatever is free
-def _fit(
-    camera: Camera, mount: Mount, pairs: SegmentPairs, terms: _Terms, max_steps: int
-) -> CalibrationResult:
-    start = start_at(mount)
+def _fit(start: Estimate, pairs: SegmentPairs, terms: _Terms, max_steps: int) -> CalibrationResult:
     is_free, prior = terms.is_free, terms.prior_sigma
+    at = lambda by: Estimate(start.given, jnp.where(is_free, by, start.by))
 
-    def residuals(by: Float[Array, "8"], pairs: SegmentPairs) -> Float[Array, "N 4"]:
-        by = jnp.where(is_free, by, 0)
-        r = all_distances(camera, start.moved(by), pairs) / pairs.sigma
-        r = jnp.where(pairs.valid[:, None], r, 0)
+    # lens, clock and shutter to first order about the start; rounds make them exact
+    seen, by_estimate = jax.vmap(seen_near, in_axes=(None, 0))(start, pairs)
+
+    def residuals(by: Float[Array, "17"], seen: Seen) -> Float[Array, "N 4"]:
+        estimate = at(by)
+        r = jax.vmap(distances, in_axes=(None, 0))(
+            estimate, seen.moved(by_estimate @ (estimate.by - start.by))
+        )
+        r = jnp.where(pairs.valid[:, None], r / pairs.sigma, 0)
         # the four distances of a pair are two equations stated from both sides: they count half
         return jax.vmap(robust, in_axes=(0, None))(r / 2**0.5, terms.loss_scale)
 
     def with_priors(
-        by: Float[Array, "8"], _: None
-    ) -> tuple[Float[Array, "N 4"], Float[Array, "8"]]:
-        return residuals(by, pairs), jnp.where(is_free, by / prior, by)
+        by: Float[Array, "17"], _: None
+    ) -> tuple[Float[Array, "N 4"], Float[Array, "17"]]:
+        return residuals(by, seen), jnp.where(is_free, by / prior, by - start.by)
 
     found = optx.least_squares(
         with_priors,
-        optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8, linear_solver=lx.Normal(lx.Cholesky())),
-        jnp.zeros(U),
+        optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky())),
+        start.by,
         max_steps=max_steps,
         throw=False,
     )
-    by = jnp.where(is_free, found.value, 0)
-    estimate = start.moved(by)
-    birge_ratio = _birge_ratio(by[ODOMETER] / prior[ODOMETER], is_free[ODOMETER])
-    covariance = birge_ratio**2 * _sandwich(residuals, by, pairs, prior, terms.pixel_sigma)
+    estimate = at(found.value)
+    birge_ratio = _birge_ratio(estimate.bias / prior[ODOMETER], is_free[ODOMETER])
+    covariance = birge_ratio**2 * _sandwich(
+        residuals, estimate.by, pairs, seen, prior, terms.pixel_sigma
+    )
     covariance = jnp.where(is_free[:, None] & is_free, covariance, 0)
     weakest_sigma, weakest, known_well = _weakest(terms.limit, covariance)
     enough = jnp.sum(pairs.valid) >= terms.min_pairs
-    unit = jnp.ones(U).at[0].set(estimate.mount.height)  # log height to metres
-    r, r_priors = with_priors(by, None)
+    r, r_priors = with_priors(found.value, None)
     return CalibrationResult(
-        mount=estimate.mount,
-        odometer=estimate.bias,
-        covariance=covariance * jnp.outer(unit, unit),
-        residuals=jnp.where(pairs.valid[:, None], all_distances(camera, estimate, pairs), 0),
+        estimate=estimate,
+        covariance=covariance,
+        residuals=jnp.where(pairs.valid[:, None], all_distances(estimate, pairs), 0),
         observable=is_free & known_well & enough,
         weakest=weakest,
         weakest_sigma=weakest_sigma,
@@ -174,11 +192,12 @@ def _fit(
 
 def _sandwich(
     residuals: Residuals,
-    by: Float[Array, "8"],
+    by: Float[Array, "17"],
     pairs: SegmentPairs,
-    prior: Float[Array, "8"],
+    seen: Seen,
+    prior: Float[Array, "17"],
     pixel_sigma: Float[Array, ""],
-) -> Float[Array, "8 8"]:
+) -> Float[Array, "17 17"]:
     """Covariance of the estimate from how the clusters disagree: A^-1 (Σ g gᵀ) A^-1.
 
     Errors of pairs that share images, a line or an odometer's reading are correlated: the inverse
@@ -192,7 +211,7 @@ def _sandwich(
     that jittered segments would add is measured, and not counted in A.
     """
     jacobian = jax.jacfwd(residuals)
-    J, r = jacobian(by, pairs), residuals(by, pairs)
+    J, r = jacobian(by, seen), residuals(by, seen)
     K = jnp.diag(1 / prior)
     A = jnp.einsum("nri,nrj->ij", J, J) + K @ K
     by_cluster = lambda x: jax.ops.segment_sum(x, pairs.cluster, len(x))
@@ -202,10 +221,8 @@ def _sandwich(
     middle = g.T @ g + K @ K
 
     keys = jax.random.split(jax.random.key(0))
-    jitter = [pixel_sigma * jax.random.rademacher(k, pairs.first.shape, float) for k in keys]
-    jittered = eqx.tree_at(
-        lambda p: (p.first, p.second), pairs, (pairs.first + jitter[0], pairs.second + jitter[1])
-    )
+    jitter = [pixel_sigma * jax.random.rademacher(k, seen.first.shape, float) for k in keys]
+    jittered = Seen(seen.first + jitter[0], seen.second + jitter[1], seen.T_first_second)
     L = jnp.linalg.cholesky(A)
     from_noise = jacobian(by, jittered) - J
     from_noise = jnp.einsum("nri,nrj->ij", from_noise, from_noise)
@@ -230,8 +247,8 @@ def _birge_ratio(off: Float[Array, "4"], is_free: Bool[Array, "4"]) -> Float[Arr
 
 
 def _weakest(
-    limit: Float[Array, "8"], covariance: Float[Array, "8 8"]
-) -> tuple[Float[Array, ""], Float[Array, "8"], Bool[Array, "8"]]:
+    limit: Float[Array, "17"], covariance: Float[Array, "17 17"]
+) -> tuple[Float[Array, ""], Float[Array, "17"], Bool[Array, "17"]]:
     """The widest direction of the covariance in units of `limit`: its sigma, and a unit vector.
 
     The last value is, for each unknown, whether its own standard deviation is below its limit.

@@ -7,7 +7,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sofjax._checks import check_fields
 from sofjax.calibration.pairs import Estimate, SegmentPairs, U, all_distances
-from sofjax.geometry.camera import Camera
 
 
 class FloorTestConfig(eqx.Module):
@@ -24,7 +23,6 @@ class FloorTestConfig(eqx.Module):
 @eqx.filter_jit
 def lies_on_floor(
     config: FloorTestConfig,
-    camera: Camera,
     estimate: Estimate,
     pairs: SegmentPairs,
     line: Int[Array, "N"],
@@ -42,7 +40,7 @@ def lies_on_floor(
 
     def of_height(log_height: Float[Array, ""]) -> Float[Array, "N 4"]:
         moved = estimate.moved(jnp.zeros(U).at[0].set(log_height))
-        r = all_distances(camera, moved, pairs) / pairs.sigma
+        r = all_distances(moved, pairs) / pairs.sigma
         return jnp.where(pairs.valid[:, None], r, 0)
 
     r, J = jax.jvp(of_height, (jnp.zeros(()),), (jnp.ones(()),))

@@ -13,11 +13,11 @@ from sofjax.calibration.pairs import Estimate, SegmentPairs
 from sofjax.extraction.observation import Observation
 from sofjax.extraction.sof import below_horizon
 from sofjax.geometry.angles import wrap
-from sofjax.geometry.camera import Camera
 from sofjax.geometry.lines import cofactor, line_point_distance, line_through
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import overlap
 from sofjax.geometry.two_view import transfer_segment, two_view_homography
+from sofjax.rig import corrected
 
 
 class TrackConfig(eqx.Module):
@@ -38,16 +38,14 @@ class TrackConfig(eqx.Module):
         )
 
 
-def follow(
-    config: TrackConfig, camera: Camera, estimate: Estimate, log: Observation
-) -> Int[np.ndarray, "T M"]:
+def follow(config: TrackConfig, estimate: Estimate, log: Observation) -> Int[np.ndarray, "T M"]:
     """A number for every segment, the same for all segments of one line; -1 for none.
 
     Successive images are so near that a mount wrong by a third still predicts where a segment
     went. Two segments are one line only if each is the nearest of the other. Nothing is followed
     over a motion that the odometer did not read.
     """
-    partners = np.stack([np.asarray(p) for p in _partners(config, camera, estimate, log)])
+    partners = np.stack([np.asarray(p) for p in _partners(config, estimate, log)])
     valid = np.asarray(log.segments_image.valid)
     T, M = valid.shape
     track = np.full((T, M), -1)
@@ -71,13 +69,13 @@ def follow(
 
 
 @eqx.filter_jit
-def _partners(
-    config: TrackConfig, camera: Camera, estimate: Estimate, log: Observation
-) -> list[Int[Array, "T M"]]:
+def _partners(config: TrackConfig, estimate: Estimate, log: Observation) -> list[Int[Array, "T M"]]:
     """[T, M] for each lag: the segment so many images before that is the same line, or -1."""
+    rig = estimate.rig
+    log = corrected(estimate.given, rig, log)
     poses = path(jax.vmap(estimate.motion)(log.motion))
     floor = jax.vmap(below_horizon, in_axes=(None, None, 0))(
-        camera, estimate.mount, log.segments_image
+        rig.camera, rig.mount, log.segments_image
     )
     index = jnp.arange(poses.yaw.shape[0])
 
@@ -87,7 +85,7 @@ def _partners(
             at = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
             a, b = at(floor, before), at(floor, t)
             T = at(poses, before).between(at(poses, t))
-            H = two_view_homography(camera, estimate.mount, T)
+            H = two_view_homography(rig.camera, rig.mount, T)
             of_pair = lambda x, y: transfer_error(config, H, x, y)
             off = jax.vmap(lambda y: jax.vmap(lambda x: of_pair(x, y))(a.endpoints))(b.endpoints)
             off = jnp.where(a.valid[None] & b.valid[:, None] & (t >= lag), off, jnp.inf)
@@ -180,6 +178,7 @@ def relate(
         empty = np.full((capacity - len(chosen), *rows.shape[1:]), fill, rows.dtype)
         return jnp.asarray(np.concatenate([rows, empty]))
 
+    around = None if log.around is None else np.asarray(log.around, float)
     at = lambda i: SE2(jnp.asarray(poses.xy[t[i]], float), jnp.asarray(poses.yaw[t[i]], float))
     pairs = SegmentPairs(
         first=pad(endpoints[t[a], m[a]]),
@@ -188,6 +187,7 @@ def relate(
         valid=jnp.arange(capacity) < len(chosen),
         sigma=jnp.ones((capacity, 4)),
         cluster=pad(_stretches(travelled[t[a]], travelled[-1], config.max_baseline)),
+        around=None if around is None else (pad(around[t[a]]), pad(around[t[b]])),
     )
     return pairs, pad(line, -1)
 

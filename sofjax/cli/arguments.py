@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from sofjax.cli import arguments_simulate
-from sofjax.pipeline.outcomes import LOOPS
+from sofjax.pipeline.outcomes import FREE, LOOPS
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[Any]
 
 QUOTED = 200  # characters of the message of a word that is no option
-# calibration.UNKNOWNS and vision.boards.PATTERNS, which would take the parser a second to import
-FREE = ("height", "pitch", "roll", "yaw", "distance", "left", "right", "curvature")
+# vision.boards.PATTERNS, which would take the parser a second to import
 PATTERNS = ("chessboard", "circles", "acircles", "charuco")
 BY_DEFAULT = "height,pitch,roll"
 
@@ -56,7 +55,7 @@ def _run(commands: "Commands") -> None:
     parser.add_argument(
         "--calibrate",
         action="store_true",
-        help="first fit the camera's height, pitch and roll to the drive, and run with them",
+        help="first fit mount, lens, clock and odometer to the drive, as `calibrate robot` does",
     )
     parser.add_argument(
         "--loop",
@@ -110,6 +109,7 @@ def _calibrate(commands: "Commands") -> None:
     )
     parts = parser.add_subparsers(title="what to calibrate", metavar="WHAT", required=True)
     _calibrate_camera(parts)
+    _calibrate_robot(parts)
     _calibrate_mount(parts)
 
 
@@ -164,20 +164,34 @@ def _calibrate_camera(parts: "Commands") -> None:
     parser.set_defaults(command="calibrate camera")
 
 
+def _calibrate_robot(parts: "Commands") -> None:
+    parser = parts.add_parser(
+        "robot",
+        help="mount, lens, clock and odometer from a drive, as far as it tells them",
+        description="Fit to a drive what it tells of the robot: the camera's height and tilt, and, "
+        "where the images contradict what the camera file says, its yaw and lever arm, its focal "
+        "length, centre and lens, and the offset of its clock. Some metres over a floor with lines "
+        "across the way, with straight parts and turns both ways.",
+    )
+    _add_drive_fit(parser)
+    parser.add_argument(
+        "--free",
+        metavar="height,focal,...",
+        help=f"what to fit in any case, of {', '.join(FREE)}; default: {BY_DEFAULT}, the "
+        "odometer's errors in turning, and what the drive contradicts of the others, but for the "
+        "line delay, which wants turns at several speeds, and the distance, which is the measure",
+    )
+    parser.set_defaults(command="calibrate robot", joint=False)
+
+
 def _calibrate_mount(parts: "Commands") -> None:
     parser = parts.add_parser(
         "mount",
-        help="the camera's height and tilt from a drive",
+        help="the camera's height and tilt alone from a drive",
         description="Fit where the camera sits on the robot to what it sees on a drive: some "
         "metres over a floor with lines across the way, with straight parts.",
     )
-    parser.add_argument("drive", metavar="DRIVE", type=Path, help="folder of the drive")
-    parser.add_argument(
-        "--initial",
-        metavar="height=1.0,pitch=0.2,...",
-        help="where to begin, metres and radians, in the place of what the camera file says; "
-        "30 %% and 8 degrees off will do",
-    )
+    _add_drive_fit(parser)
     parser.add_argument(
         "--free",
         metavar="height,pitch,...",
@@ -190,12 +204,22 @@ def _calibrate_mount(parts: "Commands") -> None:
         action="store_true",
         help="then solve all poses, lines, their heights and the mount together",
     )
+    parser.set_defaults(command="calibrate mount")
+
+
+def _add_drive_fit(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("drive", metavar="DRIVE", type=Path, help="folder of the drive")
+    parser.add_argument(
+        "--initial",
+        metavar="height=1.0,pitch=0.2,...",
+        help="where to begin, metres and radians, in the place of what the camera file says; "
+        "30 %% and 8 degrees off will do",
+    )
     _add_out(
         parser,
         "the camera file to write; default camera.yaml. A figure is drawn beside it. "
         "Files that sofjax has not written are not replaced",
     )
-    parser.set_defaults(command="calibrate mount")
 
 
 def _add_out(parser: argparse.ArgumentParser, what: str) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from sofjax.cli import (
     calibrate_camera,
-    calibrate_mount,
+    calibrate_robot,
     demo,
     evaluate,
     inspect,
@@ -22,7 +22,8 @@ COMMANDS = {
     "evaluate": evaluate.run,
     "inspect": inspect.run,
     "calibrate camera": calibrate_camera.run,
-    "calibrate mount": calibrate_mount.run,
+    "calibrate robot": calibrate_robot.run,
+    "calibrate mount": calibrate_robot.run,
     "simulate": simulate.run,
     "demo": demo.run,
 }

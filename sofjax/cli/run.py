@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sofjax.cli import calibrate_mount, summaries
+from sofjax.cli import calibrate_robot, summaries
 from sofjax.cli.progress import bar
 from sofjax.pipeline import stopping
 
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         if args.calibrate:
             fitted = _calibrate(drive, settings, writer)
             if fitted is None:
-                return calibrate_mount.REFUSED
+                return calibrate_robot.REFUSED
             drive = fitted
             frontend = Frontend(drive.camera_file, settings.frontend, bits=frontend.bits)
         with bar(len(drive.image_files), drive.name, "frame") as progress:
@@ -67,12 +67,13 @@ def settings_of(args: argparse.Namespace) -> "RunSettings":
 
 
 def _calibrate(drive: "Drive", settings: "RunSettings", writer: "RunWriter") -> "Drive | None":
-    """`--calibrate`: the drive with the mount that is fitted to it; None if it is not usable."""
+    """`--calibrate`: the drive with the rig that is fitted to it; None if it is not usable."""
     from sofjax import viewer
     from sofjax.pipeline import calibrate_drive, run_folder
+    from sofjax.pipeline.calibrate import IF_TOLD
 
     with bar(len(drive.image_files), "segments") as progress:
-        found = calibrate_drive(drive, settings.frontend, progress=progress)
+        found = calibrate_drive(drive, settings.frontend, progress=progress, more=IF_TOLD)
     print(summaries.of_calibration(found))
     if not found.usable:
         print("the drive is not run: measure the mount, or leave --calibrate out")

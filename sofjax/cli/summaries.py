@@ -70,7 +70,7 @@ def of_calibration(found: "Calibration") -> str:
     from sofjax.calibration.assessment import SCALE
 
     drive, fit = found.drive, found.fit
-    path = drive.odometry.at(drive.image_stamps).travelled[-1]
+    path = drive.odometry_at_images.travelled[-1]
     lines = [
         f"{drive.name}: {len(drive.image_files)} images, {path:.1f} m, {found.evidence}",
         *(f"  {line}" for line in found.estimates),

@@ -1,10 +1,13 @@
 """What the robot gives the filter at each image."""
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.segments import Segments
+
+LAGS = np.linspace(-0.35, 0.35, 15)  # seconds after an image at which the odometer is looked up
 
 
 class Observation(eqx.Module):
@@ -19,3 +22,6 @@ class Observation(eqx.Module):
     # standard deviation of what the odometer does not tell of the motion (forward, sideways, turn),
     # beyond its noise: metres and radians; None if it tells all of it
     motion_sigma: Float[Array, "*batch 3"] | None = None
+    # the odometer's way from the image to each of LAGS, as twists (v_x, v_y, omega) over it: by it
+    # an image's stamp may be wrong; None if that is not known
+    around: Float[Array, "*batch L 3"] | None = None

@@ -12,7 +12,9 @@ import numpy as np
 from sofjax.geometry import Camera, Mount
 from sofjax.io.camera_forms import camera_fields, lens, mapping, matrix, number, size
 from sofjax.io.errors import InputError, nearest, quoted
+from sofjax.io.rig_fields import RigFields, read_rig_fields, rig_lines
 from sofjax.io.text import write_atomically
+from sofjax.rig import Lens, Rig
 
 Number = TypeVar("Number", bound=SupportsFloat)
 
@@ -22,6 +24,7 @@ TO_FILL_IN = {  # placeholders in a new file for what only the user knows
     "height": "fill in the metres from the floor to the lens",
     "pitch": "fill in the radians that the camera looks down",
 }
+NO_CLOCK = RigFields()
 ROUNDING = 1e-3  # radians: an angle rounded to three digits may exceed its limit by this
 FIRST_LINE = (  # of every camera file that is written here
     "# camera_info, with the mount of the camera on the robot: metres, radians, "
@@ -39,6 +42,17 @@ class CameraFile:
     distortion_model: str  # plumb_bob, rational_polynomial or equidistant
     name: str
     remarks: tuple[str, ...] = ()  # sentences on what the file does not say
+    clock: RigFields = RigFields()  # clock, shutter and odometer
+
+    @property
+    def rig(self) -> Rig:
+        """The rig, whose clock and shutter are those of the file."""
+        fisheye = self.distortion_model == "equidistant"
+        number = lambda value: jnp.asarray(value, float)
+        return Rig(
+            self.camera, self.mount, Lens.of(self.distortion, fisheye),
+            number(self.clock.time_offset), number(self.clock.line_delay),
+        )  # fmt: skip
 
 
 def read_camera(path: Path) -> CameraFile:
@@ -62,6 +76,7 @@ def read_camera(path: Path) -> CameraFile:
         distortion_model=model,
         name=path.parent.name if name is None else str(name),
         remarks=tuple(remarks),
+        clock=read_rig_fields(path, fields),
     )
 
 
@@ -75,6 +90,7 @@ def write_camera(path: Path, camera_file: CameraFile) -> None:
         camera_file.distortion,
         camera_file.name,
         {key: getattr(mount, key) for key in MOUNT_FIELDS},
+        clock=camera_file.clock,
     )
 
 
@@ -86,6 +102,7 @@ def write_intrinsics(
     name: str,
     mount: Mapping[str, SupportsFloat],
     notes: Sequence[str] = (),
+    clock: RigFields = NO_CLOCK,
 ) -> None:
     """Write a camera file; only some fields of its mount need be known.
 
@@ -95,6 +112,7 @@ def write_intrinsics(
     **Arguments:**
     - `mount`: metres and radians by the names of `Mount`'s fields.
     - `notes`: lines to stand as comments at the top.
+    - `clock`: of which only what is not zero is written.
     """
     mount = {**mount, **_canonical({key: mount[key] for key in ANGLES if key in mount})}
     placed = ", ".join(
@@ -115,7 +133,8 @@ def write_intrinsics(
         f"camera_matrix: {{rows: 3, cols: 3, data: [{K}]}}\n"
         f"distortion_model: {distortion_model}\n"
         f"distortion_coefficients: {{rows: 1, cols: {len(distortion)}, data: [{data}]}}\n"
-        f"mount: {{{placed}}}\n",
+        f"mount: {{{placed}}}\n"
+        f"{rig_lines(clock)}",
     )
 
 

@@ -42,6 +42,7 @@ KNOWN = {
     *("image_width", "width", "image_height", "height", "resolution", *MATRIX, "intrinsics"),
     *("distortion_model", "fisheye_model", *COEFFICIENTS, "camera_model", "camera_name", "mount"),
     *("rectification_matrix", "projection_matrix", "r", "p"),
+    *("time_offset", "line_delay", "odometer", "sigma"),
 }
 
 

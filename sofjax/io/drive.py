@@ -49,6 +49,16 @@ class Drive:
     groundtruth: Trajectory | None
     floor_segments: np.ndarray | None  # [S, 2, 2] float64, the true segments, world frame, metres
 
+    @property
+    def odometer_stamps(self) -> np.ndarray:
+        """[T] The stamps of the images by the odometer's clock, seconds."""
+        return self.image_stamps + self.camera_file.clock.time_offset
+
+    @property
+    def odometry_at_images(self) -> Trajectory:
+        """[T] The odometer's poses when the images were taken."""
+        return self.odometry.at(self.odometer_stamps)
+
 
 def read_drive(path: Path) -> Drive:
     """Read and check a drive's folder.
@@ -69,13 +79,14 @@ def read_drive(path: Path) -> Drive:
     if nanoseconds:
         remarks.append("the timestamps are nanoseconds, and were read as such")
     span = read.trajectory.span()
-    if outside(read.trajectory, stamps).all():
+    stamps_odometer = stamps + camera_file.clock.time_offset
+    if outside(read.trajectory, stamps_odometer).all():
         raise InputError(
             f"{path}: the images ({stamps[0]:.3f} to {stamps[-1]:.3f} s) and the odometry "
             f"({span}) never meet; both need the timestamps of one clock, in seconds"
         )
     mended, outages = mend("odometry.txt", read.lines, read.trajectory)
-    odometry, beyond = extended("odometry.txt", mended, stamps)
+    odometry, beyond = extended("odometry.txt", mended, stamps_odometer)
     return Drive(
         path=path,
         name=path.resolve().name,
@@ -154,11 +165,31 @@ def motions(drive: Drive) -> np.ndarray:
     The odometry is interpolated at the stamps of the images. The first motion is the identity, and
     so is one between two images beyond the ends of the odometry.
     """
-    at = drive.odometry.at(drive.image_stamps)
+    at = drive.odometry_at_images
     dx, dy = np.diff(at.xy, axis=0).T
     c, s = np.cos(at.yaw[:-1]), np.sin(at.yaw[:-1])
     steps = np.stack([c * dx + s * dy, c * dy - s * dx, np.diff(at.yaw)], axis=-1)
     return np.concatenate([np.zeros((1, 3)), steps])
+
+
+def ways_around(drive: Drive, lags: np.ndarray) -> np.ndarray:
+    """The odometer's way from each image to some seconds after it, or before.
+
+    **Arguments:**
+    - `lags`: [L], seconds.
+
+    **Returns:** [T, L, 3] twists (v_x, v_y, omega) over the lag, metres and radians; nothing moves
+    beyond the ends of the odometry.
+    """
+    stamps = drive.odometer_stamps
+    here, there = drive.odometry.at(stamps), drive.odometry.at(stamps[:, None] + lags)
+    dx, dy = np.moveaxis(there.xy - here.xy[:, None], -1, 0)
+    c, s = np.cos(here.yaw)[:, None], np.sin(here.yaw)[:, None]
+    turn = there.yaw - here.yaw[:, None]
+    x, y, half = c * dx + s * dy, c * dy - s * dx, turn / 2
+    small = np.abs(half) < 1e-6
+    a = np.where(small, 1.0, half / np.tan(np.where(small, 1.0, half)))  # the logarithm of SE(2)
+    return np.stack([a * x + half * y, a * y - half * x, turn], axis=-1)
 
 
 def motion_sigmas(drive: Drive) -> np.ndarray | None:
@@ -168,14 +199,14 @@ def motion_sigmas(drive: Drive) -> np.ndarray | None:
     where the odometry gives the motion; None if it always does.
     """
     speeds = usual_speeds(drive.odometry)
-    return unknown_motion(drive.outages, speeds, drive.image_stamps)
+    return unknown_motion(drive.outages, speeds, drive.odometer_stamps)
 
 
 def odometry_warnings(drive: Drive) -> list[str]:
     """Sentences on where the odometry does not give the motion, each with the images in it."""
     found = []
     for outage in drive.outages[:MANY]:
-        edges = np.clip(drive.image_stamps, outage.begin, outage.end)
+        edges = np.clip(drive.odometer_stamps, outage.begin, outage.end)
         images = int((np.diff(edges) > 0).sum())
         between = "what lies between" if outage.bridged else "the motion there"
         found.append(f"{outage.sentence}; {between} is taken as unknown ({images} images)")

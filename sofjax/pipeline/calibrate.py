@@ -1,4 +1,4 @@
-"""`calibrate_drive`: where the camera sits on the robot, from what it sees on a drive."""
+"""`calibrate_drive`: what camera, mount, clock and odometer are, from what is seen on a drive."""
 
 import dataclasses
 import functools
@@ -11,39 +11,50 @@ import jax.numpy as jnp
 import numpy as np
 
 from sofjax._pytree import in_double
-from sofjax.calibration import TURNS, UNKNOWNS, DriveFit, DriveFitConfig, FitConfig, fit_drive
-from sofjax.calibration.assessment import doubts, estimates
+from sofjax.calibration import (
+    MOUNT,
+    TURNS,
+    UNKNOWNS,
+    DriveFit,
+    DriveFitConfig,
+    FitConfig,
+    fit_drive,
+)
+from sofjax.calibration.assessment import accuracy, doubts, estimates, grade
 from sofjax.calibration.joint import fit_jointly
 from sofjax.extraction.observation import Observation
-from sofjax.geometry import Camera, Mount
-from sofjax.io.camera_file import MOUNT_FIELDS, CameraFile, write_intrinsics
+from sofjax.geometry import Camera
+from sofjax.io.camera_file import MOUNT_FIELDS, CameraFile, RigFields, write_intrinsics
 from sofjax.io.drive import Drive
 from sofjax.io.errors import InputError
+from sofjax.motion import BIAS
 from sofjax.pipeline.outcomes import FitVerdict
 from sofjax.pipeline.progress import Progress, watched
 from sofjax.pipeline.setup_checks import fitted_height
+from sofjax.rig import INTRINSICS, RIG, Rig, corrected
 from sofjax.slam.presets import PRESETS
 from sofjax.vision import Frontend, FrontendSettings, observe_drive
 
-MOUNT, ODOMETER = UNKNOWNS[:4], UNKNOWNS[4:]
-BY_DEFAULT = ("height", "pitch", "roll")
-STANDS_STILL = 0.05  # metres and radians, below which a drive tells nothing of a mount
+BY_DEFAULT = MOUNT[:3]
+# what a drive may tell beside them. Not the line delay: at a constant speed it is like a bent lens
+IF_TOLD = tuple(name for name in RIG if name not in (*BY_DEFAULT, "line_delay"))
+STANDS_STILL = 0.05  # metres and radians, below which a drive tells nothing of a rig
 FRONTEND = FrontendSettings()
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A drive's mount, judged."""
+    """A drive's rig, judged."""
 
-    drive: Drive  # with the mount as it was
-    camera_file: CameraFile  # with the new mount, whether it is usable or not
+    drive: Drive  # with the rig as it was
+    camera_file: CameraFile  # with the new one, whether it is usable or not
     verdict: FitVerdict
     sentence: str  # how well the mount is known, or why it is not
     evidence: str  # what it is from, in words
     estimates: list[str]  # each number that was fitted, in words
     residual_px: float  # root mean square
     odometer: np.ndarray  # [4] systematic errors of the odometer
-    covariance: np.ndarray  # [8, 8] of `UNKNOWNS`
+    covariance: np.ndarray  # [17, 17] of `UNKNOWNS`, in the units of `rig.RIG`
     fit: DriveFit
 
     @property
@@ -52,7 +63,7 @@ class Calibration:
 
     @property
     def calibrated_drive(self) -> Drive:
-        """The drive with the new mount."""
+        """The drive with the new rig."""
         return dataclasses.replace(self.drive, camera_file=self.camera_file)
 
     @property
@@ -60,9 +71,12 @@ class Calibration:
         """All of it by name, for `report.json`."""
         sigma = np.sqrt(np.diag(self.covariance))
         observable = np.asarray(self.fit.fit.observable)
+        unit = {"height": float(self.camera_file.mount.height)}  # metres, as `before` and `after`
+        by = np.asarray(self.fit.estimate.by)
         return {
             "usable": self.usable,
             "verdict": self.sentence,
+            "grade": str(self.verdict),
             "pairs": int(self.fit.pairs.valid.sum()),
             "related": self.fit.related,
             "residual_px": self.residual_px,
@@ -70,18 +84,20 @@ class Calibration:
             "starts_agreeing": self.fit.agreeing,
             "before": {k: float(getattr(self.drive.camera_file.mount, k)) for k in MOUNT},
             "after": {k: float(getattr(self.camera_file.mount, k)) for k in MOUNT},
-            "sigma": dict(zip(UNKNOWNS, sigma.tolist(), strict=True)),
-            "odometer": dict(zip(ODOMETER, self.odometer.tolist(), strict=True)),
+            "fitted": list(self.fit.free),
+            "changed_by": {k: float(by[UNKNOWNS.index(k)]) for k in self.fit.free},
+            "sigma": {k: float(s) * unit.get(k, 1.0) for k, s in zip(UNKNOWNS, sigma, strict=True)},
+            "odometer": dict(zip(BIAS, self.odometer.tolist(), strict=True)),
             "observable": dict(zip(UNKNOWNS, observable.tolist(), strict=True)),
         }
 
     def write(self, path: Path) -> None:
-        """The camera file with the new mount; lens and all else as they were."""
+        """The camera file with what was fitted; all else as it was."""
         file = self.camera_file
-        notes = [f"mount from {self.drive.name}, {self.evidence}", *self.estimates]
+        notes = [f"calibrated on {self.drive.name}, {self.evidence}", *self.estimates]
         write_intrinsics(
             path, file.camera, file.distortion_model, file.distortion, file.name,
-            {key: getattr(file.mount, key) for key in MOUNT_FIELDS}, notes,
+            {key: getattr(file.mount, key) for key in MOUNT_FIELDS}, notes, file.clock,
         )  # fmt: skip
 
 
@@ -91,54 +107,95 @@ def calibrate_drive(
     free: tuple[str, ...] = BY_DEFAULT,
     joint: bool = False,
     progress: Progress | None = None,
+    more: tuple[str, ...] = (),
 ) -> Calibration:
-    """The mount fitted to a drive, and what it is worth.
+    """The rig fitted to a drive, and what it is worth.
 
     **Arguments:**
     - `drive`: of some metres; its mount is where the fit begins, 30 % and 8 degrees off will do.
     - `free`: what to fit, of `calibration.UNKNOWNS`; the odometer's errors in turning always are.
     - `joint`: then solve all poses, lines, their heights and the mount together.
     - `progress`: called after each image that is searched.
+    - `more`: what else to fit where the drive contradicts it as it was given, such as `IF_TOLD`.
+      With it the new camera file has the odometer's errors too.
 
     **Raises:** `InputError` if the robot never moves; `ValueError` for what cannot be fitted.
     """
-    _check_free(free, joint)
+    _check_free((*free, *more), joint)
     _check_moves(drive)
     images = functools.partial(watched, progress=progress)
     log = observe_drive(drive, Frontend.of(drive, frontend), images)
-    # the odometer's turning errs more than anything; its distance is the measure of the height
-    config = DriveFitConfig(fit=FitConfig(free=tuple(dict.fromkeys([*free, *TURNS]))))
+    config = _config(drive.camera_file, free, more)
     with jax.enable_x64(True):
-        camera, mount, log = in_double((drive.camera_file.camera, drive.camera_file.mount, log))
-        found = fit_drive(camera, mount, log, config)
+        given, log = in_double((drive.camera_file.rig, log))
+        found = fit_drive(given, log, config)
         assessment = found.verdict(config)
         usable = assessment.usable
-        fitted, covariance = jax.device_get(found.fit.mount), found.covariance
-        odometer = np.asarray(found.fit.odometer)
+        found, covariance = jax.device_get(found), found.covariance
+        rig = jax.device_get(found.estimate.rig)
         if usable and joint:
-            fitted, covariance = _jointly(camera, found, log, free)
+            rig, covariance = _jointly(found, log, free)
         residuals = np.asarray(found.fit.residuals)[np.asarray(found.pairs.valid)]
+    file = _fitted_file(drive.camera_file, found, rig, covariance, bool(more))
     doubt = "; ".join([
         *filter(None, [doubts(found.fit, config.fit)]),
-        *fitted_height(float(fitted.height), float(mount.height)),
+        *fitted_height(float(rig.mount.height), float(drive.camera_file.mount.height)),
     ])  # fmt: skip
     evidence = f"{len(residuals)} of {found.related} pairs of segments taken for floor"
     evidence += ", then jointly with poses and lines" * (usable and joint)
-    fields = (jnp.asarray(value, float) for value in dataclasses.astuple(fitted))
-    known = _accuracy(fitted, covariance) + f"; {doubt}" * bool(doubt)
-    verdict = FitVerdict.DOUBTFUL if doubt else FitVerdict.GOOD
+    known = accuracy(covariance, found.free) + f"; {doubt}" * bool(doubt)
+    verdict = FitVerdict.DOUBTFUL if doubt else FitVerdict(grade(covariance))
+    odometer = np.asarray(found.fit.odometer)
     return Calibration(
         drive=drive,
-        camera_file=dataclasses.replace(drive.camera_file, mount=type(fitted)(*fields)),
+        camera_file=file,
         verdict=verdict if usable else FitVerdict.NOT_USABLE,
         sentence=known if usable else assessment.sentence,
         evidence=evidence,
-        estimates=estimates(fitted, odometer, covariance, config.fit.free),
+        estimates=estimates(rig, odometer, covariance, found.free),
         residual_px=float(np.sqrt(np.mean(residuals**2))) if len(residuals) else math.nan,
         odometer=odometer,
         covariance=covariance,
         fit=found,
     )
+
+
+def _config(file: CameraFile, free: tuple[str, ...], more: tuple[str, ...]) -> DriveFitConfig:
+    """What is known beforehand is what the file says of it."""
+    usual = FitConfig().prior_sigma
+    known = [file.clock.sigma.get(name, sigma) if name in INTRINSICS else sigma
+             for name, sigma in zip(UNKNOWNS, usual, strict=True)]  # fmt: skip
+    # the odometer's turning errs more than anything; its distance is the measure of the height
+    fit = FitConfig(
+        free=tuple(dict.fromkeys([*free, *TURNS])),
+        prior_sigma=tuple(max(sigma, 1e-6) for sigma in known),
+    )
+    return DriveFitConfig(fit=fit, more=more)
+
+
+def _fitted_file(
+    file: CameraFile, found: DriveFit, rig: Rig, covariance: np.ndarray, robot: bool
+) -> CameraFile:
+    """The camera file with what was fitted, in its own precision; what was held is untouched."""
+    given = file.rig
+    moved = {UNKNOWNS[i] for i in np.flatnonzero(np.asarray(found.estimate.by))}
+    number = lambda value: jnp.asarray(value, float)
+    mount = jax.tree.map(number, rig.mount)
+    camera, distortion, clock = file.camera, file.distortion, file.clock
+    if moved & {"focal", "cx", "cy"}:
+        camera = Camera(number(rig.camera.K), camera.width, camera.height)
+    if moved & {"k1", "k2"}:
+        by = np.asarray(rig.lens.coefficients - np.asarray(given.lens.coefficients), float)
+        distortion = np.pad(distortion, (0, max(0, 2 - len(distortion))))
+        distortion = distortion + np.pad(by[:2], (0, len(distortion) - 2))
+    if robot:
+        sigma = np.sqrt(np.diag(covariance))
+        known = {k: float(sigma[UNKNOWNS.index(k)]) for k in found.free}
+        clock = RigFields(
+            float(rig.time_offset), float(rig.line_delay), tuple(map(float, found.fit.odometer)),
+            {**clock.sigma, **known},
+        )  # fmt: skip
+    return dataclasses.replace(file, camera=camera, mount=mount, distortion=distortion, clock=clock)
 
 
 def _check_free(free: tuple[str, ...], joint: bool) -> None:
@@ -152,7 +209,7 @@ def _check_free(free: tuple[str, ...], joint: bool) -> None:
 
 
 def _check_moves(drive: Drive) -> None:
-    at = drive.odometry.at(drive.image_stamps)
+    at = drive.odometry_at_images
     turned = float(np.abs(np.diff(at.yaw)).sum())
     if at.travelled[-1] < STANDS_STILL and turned < STANDS_STILL:
         raise InputError(
@@ -162,24 +219,19 @@ def _check_moves(drive: Drive) -> None:
         )
 
 
-def _jointly(
-    camera: Camera, found: DriveFit, log: Observation, free: tuple[str, ...]
-) -> tuple[Mount, np.ndarray]:
-    """The mount of the joint solve, and a covariance that covers its difference to the pairs'."""
-    pairs = jax.device_get(found.fit.mount)
-    solved = fit_jointly(PRESETS["default"], camera, found.fit.mount, log, free)
+def _jointly(found: DriveFit, log: Observation, free: tuple[str, ...]) -> tuple[Rig, np.ndarray]:
+    """The rig of the joint solve, and a covariance that covers its difference to the pairs'."""
+    rig = found.estimate.rig
+    pairs = jax.device_get(rig.mount)
+    log = corrected(found.estimate.given, rig, log)
+    solved = fit_jointly(PRESETS["default"], rig.camera, rig.mount, log, free)
     mount = jax.device_get(solved.mount)
-    difference = np.array([getattr(mount, k) - getattr(pairs, k) for k in MOUNT] + [0.0] * 4)
+    off = [float(getattr(mount, k) - getattr(pairs, k)) for k in MOUNT]
+    off[0] /= float(mount.height)
+    difference = np.pad(np.array(off), (0, len(UNKNOWNS) - len(off)))
     # residuals of one line, one image, one odometer are not independent: the joint solve's own
     # covariance is too narrow by far
-    return mount, found.covariance + np.outer(difference, difference)
-
-
-def _accuracy(mount: Mount, covariance: np.ndarray) -> str:
-    """How well each of height, pitch and roll is known, if it was free."""
-    sigma = np.sqrt(np.diag(covariance))
-    share = 100 * sigma[0] / float(mount.height)
-    parts = [f"height to {share:.2g} %"] * bool(sigma[0])
-    parts += [f"{k} to {np.degrees(sigma[i]):.2g}°" for i, k in ((1, "pitch"), (2, "roll"))
-              if sigma[i]]  # fmt: skip
-    return "known " + ", ".join(parts) + ", apart from the odometer's scale"
+    return (
+        dataclasses.replace(jax.device_get(rig), mount=mount),
+        found.covariance + np.outer(difference, difference),
+    )

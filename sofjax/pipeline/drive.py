@@ -43,7 +43,7 @@ def run_drive(
     file cannot be written.
     """
     writer, clock = writer or RunWriter(), _Stopwatch(begun)
-    settings = settings.used
+    settings = settings.used.on(drive.camera_file)
     frontend = frontend or Frontend.of(drive, settings.frontend)
     drive = dataclasses.replace(drive, remarks=drive.remarks + frontend.remarks)
     clock.lap("start")

@@ -107,42 +107,35 @@ def draw_calibration(path: Path, found: "Calibration") -> bool:
 
 
 def _residuals(found: "Calibration") -> list[np.ndarray]:
-    """[N, 4] pixels by the old and by the new mount, the odometer as it was found."""
-    from sofjax.calibration.pairs import Estimate, all_distances
+    """[N, 4] pixels by the old and by the new rig, the odometer as it was found."""
+    from sofjax.calibration.pairs import ODOMETER, Estimate, all_distances
 
     with jax.enable_x64(True):
-        cameras = [
-            jax.tree.map(lambda a: jnp.asarray(np.asarray(a), float), (file.camera, file.mount))
-            for file in (found.drive.camera_file, found.camera_file)
-        ]
-        return [
-            np.asarray(
-                all_distances(camera, Estimate(mount, found.fit.fit.odometer), found.fit.pairs)
-            )
-            for camera, mount in cameras
-        ]
+        estimate, pairs = jax.tree.map(jnp.asarray, (found.fit.estimate, found.fit.pairs))
+        odometer = jnp.zeros_like(estimate.by).at[ODOMETER].set(estimate.bias)
+        before = Estimate(estimate.given, odometer)
+        return [np.asarray(jax.jit(all_distances)(each, pairs)) for each in (before, estimate)]
 
 
 def _floors(found: "Calibration") -> tuple[list[list[np.ndarray]], Extent]:
-    """Two images on the floor, a stretch of the path apart, by the old and the new mount."""
+    """Two images on the floor, a stretch of the path apart, by the old and the new rig."""
     drive = found.drive
     height = float(found.camera_file.mount.height)
-    at = drive.odometry.at(drive.image_stamps)
+    at = drive.odometry_at_images
     first, second = _straightest(at, STRETCH * height)
-    frontend = Frontend(drive.camera_file)
     c, s = np.cos(at.yaw[first]), np.sin(at.yaw[first])
     x, y = np.array([[c, s], [-s, c]]) @ (at.xy[second] - at.xy[first])
     motion = np.array([x, y, at.yaw[second] - at.yaw[first]])
     x0, x1, y0, y1 = (height * share for share in FLOOR)
     extent = (x0, x1, y0, y1)
     floors = []
-    for mount in (drive.camera_file.mount, found.camera_file.mount):
-        both = []
+    for file in (drive.camera_file, found.camera_file):
+        frontend, both = Frontend(file), []
         for i, T in ((first, np.zeros(3)), (second, motion)):
             image = read_image(drive.image_files[i])
             if image is not None:
                 image = frontend.undistort(image)
-                both.append(rectify(image, drive.camera_file.camera, mount, T, extent))
+                both.append(rectify(image, file.camera, file.mount, T, extent))
         floors.append(both)
     return floors, extent
 

@@ -5,6 +5,11 @@ Imports nothing, as the argument parser needs the words.
 
 from enum import StrEnum
 
+# what `calibrate` knows; those of `rig.RIG` and `motion.BIAS`, which would be slow to import
+FREE = (
+    "height", "pitch", "roll", "yaw", "x", "y", "focal", "cx", "cy", "k1", "k2", "time_offset",
+    "line_delay", "distance", "left", "right", "curvature",
+)  # fmt: skip
 LOOPS = ("none", "paper", "smooth")  # after the drive: nothing, the paper's closing, smoothing
 
 
@@ -18,9 +23,10 @@ class LoopStatus(StrEnum):
 
 
 class FitVerdict(StrEnum):
-    """What a fitted mount is worth."""
+    """What a fitted rig is worth."""
 
     GOOD = "good"
+    ROUGH = "rough"
     DOUBTFUL = "doubtful"
     NOT_USABLE = "not usable"
 

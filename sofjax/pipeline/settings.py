@@ -5,8 +5,10 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from sofjax.io.camera_file import CameraFile
 from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.io.settings import INLINE, Setting, read_toml, to_dict, with_settings
+from sofjax.motion import MEANS
 from sofjax.pipeline.outcomes import LOOPS
 from sofjax.segment_map.types import MAP_RULES, MapConfig
 from sofjax.slam import presets
@@ -58,6 +60,14 @@ class RunSettings:
             return self
         return with_settings(self, {"segment_map.recall": RECALL}, "loop")
 
+    def on(self, camera_file: CameraFile) -> "RunSettings":
+        """The settings with what the robot's file knows of its odometer as their prior."""
+        if not any(camera_file.clock.odometer):
+            return self
+        known = {f"motion.{name}": value
+                 for name, value in zip(MEANS, camera_file.clock.odometer, strict=True)}  # fmt: skip
+        return with_settings(self, known, "camera.yaml")
+
 
 def check(name: str, value: Setting) -> None:
     """Refuse a setting that no run can use, before anything is compiled for it.
@@ -77,7 +87,7 @@ def _what_is_right(name: str, value: Setting) -> str:
     assert not isinstance(value, str), name
     if isinstance(value, float) and not math.isfinite(value):
         return "be finite"
-    if value < 0:
+    if value < 0 and name.removeprefix("motion.") not in MEANS:
         return "not be negative"
     low, high = LIMITS.get(name, (value, value))
     return "" if low <= value <= high else f"be from {low} to {high}"

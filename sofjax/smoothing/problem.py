@@ -167,12 +167,13 @@ def residuals(unknowns: Unknowns, problem: Problem) -> Residuals:
     loose = jnp.full_like(scale_sigma, 10.0)  # keeps a line that nobody sees where it is
     line_sigma = jnp.stack([loose, loose, scale_sigma], axis=1)
     centre = problem.start.line.at[:, 2].set(1)
-    bias_sigma = jnp.sqrt(jnp.diag(prior_bias(problem.motion_model).covariance))
+    bias = prior_bias(problem.motion_model)
+    bias_sigma = jnp.sqrt(jnp.diag(bias.covariance))
     shared_sigma = jnp.concatenate([jnp.asarray(priors.mount_sigma), bias_sigma])
     return Residuals(
         pixels=pixels,
         odometer=jnp.concatenate([first, odometer]),
         tilt=unknowns.pose[:, 3:] / jnp.maximum(priors.tilt_sigma, FIXED),
         line=(unknowns.line - centre) / line_sigma,
-        shared=unknowns.shared / jnp.maximum(shared_sigma, FIXED),
+        shared=(unknowns.shared.at[4:].add(-bias.mean)) / jnp.maximum(shared_sigma, FIXED),
     )

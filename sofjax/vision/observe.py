@@ -7,16 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sofjax.extraction.observation import Observation
+from sofjax.extraction.observation import LAGS, Observation
 from sofjax.geometry import SE2, Segments
-from sofjax.io.drive import Drive, motion_sigmas, motions
+from sofjax.io.drive import Drive, motion_sigmas, motions, ways_around
+from sofjax.rig import Rig, retaken
 from sofjax.vision.frontend import REPEATED, Frontend, ImageSegments
 
 MOVED_XY, MOVED_YAW = 0.01, 0.01  # metres and radians: after a larger motion the image must change
 
 
 def observation(
-    view: ImageSegments, motion: np.ndarray, sigma: np.ndarray | None = None
+    view: ImageSegments,
+    motion: np.ndarray,
+    sigma: np.ndarray | None = None,
+    around: np.ndarray | None = None,
 ) -> Observation:
     """One image's observation.
 
@@ -24,12 +28,14 @@ def observation(
     - `view`: the image's segments.
     - `motion`: [3], T_previous_current of the odometer as (dx, dy, dyaw), metres and radians.
     - `sigma`: [3], what is not known of it beyond the odometer's noise.
+    - `around`: [L, 3], of `Observation`.
     """
     return Observation(
         segments_image=view.segments_image,
         motion=SE2(jnp.asarray(motion[:2], float), jnp.asarray(motion[2], float)),
         overflow=jnp.asarray(view.overflow, int),
         motion_sigma=None if sigma is None else jnp.asarray(sigma, float),
+        around=None if around is None else jnp.asarray(around, float),
     )
 
 
@@ -37,9 +43,24 @@ def observations(
     drive: Drive, views: Iterable[ImageSegments]
 ) -> Iterator[tuple[ImageSegments, Observation]]:
     """Each view of a drive with its observation; a view that repeats the last one is emptied."""
-    steps, sigmas = motions(drive), motion_sigmas(drive)
+    steps, sigmas, around = motions(drive), motion_sigmas(drive), ways_around(drive, LAGS)
+    rig = drive.camera_file.rig
     for i, view in enumerate(without_repeats(views, steps)):
-        yield view, observation(view, steps[i], None if sigmas is None else sigmas[i])
+        observed = observation(view, steps[i], None if sigmas is None else sigmas[i], around[i])
+        if drive.camera_file.clock.line_delay:
+            observed = _all_rows_at_once(rig, observed)
+        yield view, observed
+
+
+@jax.jit
+def _all_rows_at_once(rig: Rig, observed: Observation) -> Observation:
+    """The observation as a camera whose rows are not read out one after the other would make it."""
+    at_once = dataclasses.replace(rig, line_delay=jnp.zeros(()))
+    point = lambda x: retaken(at_once, rig, observed.around, x)
+    ends = jax.vmap(jax.vmap(point))(observed.segments_image.endpoints)
+    return dataclasses.replace(
+        observed, segments_image=Segments(ends, observed.segments_image.valid)
+    )
 
 
 def without_repeats(views: Iterable[ImageSegments], steps: np.ndarray) -> Iterator[ImageSegments]:

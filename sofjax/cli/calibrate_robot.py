@@ -1,13 +1,14 @@
-"""`sofjax calibrate mount`: the camera's height and tilt from a drive."""
+"""`sofjax calibrate robot` and `mount`: what a drive tells of camera, mount, clock and wheels."""
 
 import argparse
 import dataclasses
 from typing import TYPE_CHECKING
 
 from sofjax.cli import summaries
-from sofjax.cli.arguments import FREE
+from sofjax.cli.arguments import BY_DEFAULT
 from sofjax.cli.progress import bar
 from sofjax.io.errors import InputError, nearest, quoted
+from sofjax.pipeline.outcomes import FREE
 
 if TYPE_CHECKING:
     from sofjax.io.drive import Drive
@@ -20,8 +21,9 @@ def run(args: argparse.Namespace) -> int:
     from sofjax import viewer
     from sofjax.io.drive import read_drive
     from sofjax.pipeline import calibrate_drive, figures, run_folder
+    from sofjax.pipeline.calibrate import IF_TOLD
 
-    free = free_names(args.free)
+    free = free_names(BY_DEFAULT if args.free is None else args.free)
     if args.joint and "distance" in free:
         raise InputError("--joint keeps the odometer's distances; leave 'distance' out of --free")
     if args.out.is_dir():
@@ -32,7 +34,10 @@ def run(args: argparse.Namespace) -> int:
     drive = begin_at(read_drive(args.drive), args.initial)
     run_folder.check_writable(args.out.parent)
     with bar(len(drive.image_files), "segments") as progress:
-        found = calibrate_drive(drive, free=free, joint=args.joint, progress=progress)
+        found = calibrate_drive(
+            drive, free=free, joint=args.joint, progress=progress,
+            more=IF_TOLD if args.free is None else (),
+        )  # fmt: skip
     print(summaries.of_calibration(found))
     if found.usable:
         found.write(args.out)
