@@ -21,7 +21,7 @@ BIAS: tuple[str, ...] = (
     "right",
     "curvature",
 )  # names of the systematic errors b
-MEANS = ("distance_error", "left_error", "right_error", "curvature")  # settings: their prior means
+MEANS = ("distance_error", "left_error", "right_error", "curvature")
 
 
 class MotionModel(eqx.Module):

@@ -42,7 +42,7 @@ class CameraFile:
     distortion_model: str  # plumb_bob, rational_polynomial or equidistant
     name: str
     remarks: tuple[str, ...] = ()  # sentences on what the file does not say
-    clock: RigFields = RigFields()  # clock, shutter and odometer
+    clock: RigFields = NO_CLOCK  # clock, shutter and odometer
 
     @property
     def rig(self) -> Rig:

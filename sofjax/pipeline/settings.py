@@ -64,8 +64,8 @@ class RunSettings:
         """The settings with what the robot's file knows of its odometer as their prior."""
         if not any(camera_file.clock.odometer):
             return self
-        known = {f"motion.{name}": value
-                 for name, value in zip(MEANS, camera_file.clock.odometer, strict=True)}  # fmt: skip
+        bias = zip(MEANS, camera_file.clock.odometer, strict=True)
+        known = {f"motion.{name}": value for name, value in bias}
         return with_settings(self, known, "camera.yaml")
 
 
