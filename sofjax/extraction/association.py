@@ -19,7 +19,7 @@ class Association(eqx.Module):
     beta: float = 60.0  # weight of |theta' - theta''|, 1 / radian
     gate: float = 6.0  # Theta: epsilon must be below it
     temperature: float = 1.0  # of the gate of the soft filter, in units of epsilon
-    baseline_distance: float = 0.15  # metres between the two views, or ...
+    baseline_distance: float = 0.15  # camera heights between the two views, or ...
     baseline_angle: float = 0.15  # ... radians, whichever comes first
 
     def __check_init__(self) -> None:

@@ -39,7 +39,7 @@ def close(
 
     Arguments are those of `smoothing.smooth`.
     """
-    asked = []
+    asked, config = [], config.in_metres(camera, mount)
     for _ in range(SOLUTIONS):
         done = smooth(config, camera, mount, log, path, segment_map, rules)
         final = final_map(config.segment_map, done)

@@ -90,7 +90,8 @@ def _search(drive: Drive, frontend: Frontend, progress: Progress | None) -> Seen
         segments += view.detected
         log.append(observed)
     log = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *log)
-    config, file = PRESETS["default"], drive.camera_file
+    file = drive.camera_file
+    config = PRESETS["default"].in_metres(file.camera, file.mount)
     found, _ = extract_along(
         config.association, file.camera, file.mount, log, config.filter.max_depth
     )

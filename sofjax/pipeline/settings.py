@@ -12,7 +12,7 @@ from sofjax.motion import MEANS
 from sofjax.pipeline.outcomes import LOOPS
 from sofjax.segment_map.types import MAP_RULES, MapConfig
 from sofjax.slam import presets
-from sofjax.slam.config import FILTER_CHOICES, SlamConfig
+from sofjax.slam.config import FILTER_CHOICES, LENGTHS, SlamConfig
 from sofjax.vision import DETECTORS, FrontendSettings
 
 FRONTEND = FrontendSettings()
@@ -22,6 +22,7 @@ CHOICES = {
     "loop": LOOPS,
     "filter.choice": FILTER_CHOICES,
     "segment_map.rule": MAP_RULES,
+    "lengths": LENGTHS,
 }
 LIMITS = {
     "seed": (0, 2**32 - 1),

@@ -71,6 +71,7 @@ def _moving_as_floor(
     config: SlamConfig, camera: Camera, mount: Mount, log: Observation
 ) -> tuple[int, int]:
     """Segments that eq. (9) takes for floor, and those on the floor's side of the horizon."""
+    config = config.in_metres(camera, mount)
     max_depth = config.filter.max_depth
     found, compared = extract_along(config.association, camera, mount, log, max_depth)
     on_side = found.segments_robot.valid & compared[:, None]

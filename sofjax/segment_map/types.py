@@ -23,19 +23,19 @@ class MapConfig(eqx.Module):
     capacity: int = eqx.field(static=True, default=1024)  # K, lines that the map has room for
     nearby: int = eqx.field(static=True, default=256)  # map lines that an image may show, at most
     candidates: int = eqx.field(static=True, default=4)  # C, map lines compared per measurement
-    range: float = 5.0  # R, metres: what is farther does not extend a segment
-    length: float = 10.0  # L = 2 R, metres: a longer segment rests
+    range: float = 5.0  # R, camera heights: what is farther does not extend a segment
+    length: float = 10.0  # L = 2 R, camera heights: a longer segment rests
     rest: int = 10  # steps that a longer segment rests
-    merge_distance: float = 0.01  # metres between doubled lines
+    merge_distance: float = 0.01  # camera heights between doubled lines
     merge_angle: float = 0.035  # radians
-    join_gap: float = 0.3  # metres between two pieces of one line
+    join_gap: float = 0.3  # camera heights between two pieces of one line
     scale_sigma: float = 0.3  # prior of a line that does not lie on the floor
     scale_above: float = 1.04  # an apparent scale between these two is taken for floor: nothing ...
     scale_below: float = 0.7  # ... lies little under a floor, and reflections lie deep
     scale_gate: float = 3.0  # standard deviations from 1 that tell a line from the floor
     scale_held: float = 0.03  # its standard deviation up to which a floor line is held at 1, ...
     scale_known: float = 0.05  # ... and below which a line may be one of the final map
-    rho_drift: float = 0.002  # metres: no map line is known better than ...
+    rho_drift: float = 0.002  # camera heights: no map line is known better than ...
     theta_drift: float = 0.002  # ... this, radians
     recall: int = 1_000_000  # steps unseen after which a line is not looked for any more
     forget: int = 50  # steps unseen after which a line of few measurements is dropped

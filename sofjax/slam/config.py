@@ -1,6 +1,9 @@
 """Settings of the method, and what stays the same over a drive."""
 
+import dataclasses
+
 import equinox as eqx
+import jax.numpy as jnp
 
 from sofjax._checks import check_fields
 from sofjax.extraction.association import Association
@@ -10,6 +13,8 @@ from sofjax.motion import MotionModel
 from sofjax.segment_map import MapConfig
 
 FILTER_CHOICES = ("resample", "winner")
+LENGTHS = ("heights", "metres")
+RESOLVING = 260.0  # pixels, the focal length at which ranges are as the settings have them
 
 
 class FilterConfig(eqx.Module):
@@ -22,7 +27,7 @@ class FilterConfig(eqx.Module):
         static=True, default=False
     )  # Fig. 6, step 4: SoF for every particle
     soft: bool = eqx.field(static=True, default=False)  # for derivatives; see `SofSlam.run`
-    max_depth: float = 8.0  # metres: farther segments are not used
+    max_depth: float = 8.0  # camera heights: farther segments are not used
 
     def __check_init__(self) -> None:
         check_fields(
@@ -39,7 +44,7 @@ class FixedLagConfig(eqx.Module):
 
     keyframes: int = eqx.field(static=True, default=0)  # W, open keyframes; 0: no window
     lines: int = eqx.field(static=True, default=128)  # J, nearest map lines, solved for too
-    step: float = 0.2  # metres between keyframes, or ...
+    step: float = 0.2  # camera heights between keyframes, or ...
     turn: float = 0.15  # ... radians, whichever comes first
 
     def __check_init__(self) -> None:
@@ -55,20 +60,57 @@ class SlamConfig(eqx.Module):
     segment_map: MapConfig = MapConfig()
     filter: FilterConfig = FilterConfig()
     window: FixedLagConfig = FixedLagConfig()
+    lengths: str = eqx.field(static=True, default="heights")  # or "metres", as in the paper
+
+    def __check_init__(self) -> None:
+        check_fields(self, choices={"lengths": LENGTHS})
+
+    def in_metres(self, camera: Camera, mount: Mount) -> "SlamConfig":
+        """The settings with their lengths in metres, for one camera; those settings themselves if
+        they are so already.
+
+        A length is so many camera heights: a robot half as high sees the same images half as far
+        away. Ranges besides grow with what a pixel tells: at (r² + 1) / f heights a pixel they end
+        for any lens.
+        """
+        if self.lengths == "metres":
+            return self
+        h, f = mount.height, jnp.sqrt(camera.K[..., 0, 0] * camera.K[..., 1, 1])
+        far = lambda r: h * jnp.sqrt(jnp.maximum((r**2 + 1) * f / RESOLVING - 1, 1))
+        s, m = self, self.segment_map
+        s = eqx.tree_at(
+            lambda s: (
+                s.association.baseline_distance, s.filter.max_depth, s.window.step,
+                s.segment_map.range, s.segment_map.length, s.segment_map.merge_distance,
+                s.segment_map.join_gap, s.segment_map.rho_drift,
+            ),
+            s,
+            (
+                h * s.association.baseline_distance, far(s.filter.max_depth), h * s.window.step,
+                far(m.range), 2 * far(m.length / 2), h * m.merge_distance,
+                h * m.join_gap, h * m.rho_drift,
+            ),
+        )  # fmt: skip
+        return dataclasses.replace(s, lengths="metres")
 
 
 class Setup(eqx.Module):
-    """What stays the same over a drive: the settings, the camera and where it is mounted."""
+    """What stays the same over a drive: the settings, the camera and where it is mounted.
+
+    The lengths of its settings are in metres, whatever those were that it was made of.
+    """
 
     config: SlamConfig
     camera: Camera
     mount: Mount
 
-    def __check_init__(self) -> None:
-        for name, kind in (("config", SlamConfig), ("camera", Camera), ("mount", Mount)):
-            given = getattr(self, name)
+    def __init__(self, config: SlamConfig, camera: Camera, mount: Mount) -> None:
+        for name, given, kind in (
+            ("config", config, SlamConfig), ("camera", camera, Camera), ("mount", mount, Mount)
+        ):  # fmt: skip
             if not isinstance(given, kind):
                 raise ValueError(
                     f"{type(self).__name__}(config, camera, mount): {name} must be a "
                     f"{kind.__name__}, not a {type(given).__name__}"
                 )
+        self.config, self.camera, self.mount = config.in_metres(camera, mount), camera, mount

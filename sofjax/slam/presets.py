@@ -31,6 +31,7 @@ PAPER = SlamConfig(
         min_share=0.0,
     ),
     filter=FilterConfig(choice="winner", gate_each=True),
+    lengths="metres",
 )
 
 PRESETS = {"default": DEFAULT, "paper": PAPER}

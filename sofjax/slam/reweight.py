@@ -16,7 +16,7 @@ from sofjax.slam.config import Setup
 from sofjax.slam.extract import Extracted
 from sofjax.slam.predict import Predicted
 
-MARGIN = 1.0  # metres by which a map line may be off and still be compared
+MARGIN = 1.0  # camera heights by which a map line may be off and still be compared
 KNOWN = 0.5  # prior probability that a segment on the floor is one of the map; of the soft form
 
 
@@ -44,7 +44,7 @@ def local_map(
     config, sensor = setup.config.segment_map, setup.config.sensor
     T_world_nadir = T_world_robot @ setup.mount.T_robot_nadir
     ends = jnp.where(measurements.valid[:, None, None], measurements.endpoints_nadir, 0)
-    radius = jnp.sqrt(jnp.sum(ends**2, axis=-1).max()) + config.join_gap + MARGIN
+    radius = jnp.sqrt(jnp.sum(ends**2, axis=-1).max()) + config.join_gap + MARGIN * setup.mount.height
     near, truncated = nearby(config, segment_map, T_world_nadir, radius)
     lines = segment_map.take(near)
     candidates, at, nearest = candidate_associations(

@@ -115,7 +115,9 @@ def smooth(
 
     **Returns:** the last round's solution; `solution.converged` says whether it settled.
     """
-    priors = _priors(config, rules)
+    config, priors = config.in_metres(camera, mount), _priors(config, rules)
+    gap = rules.seeing.join_gap * float(mount.height)
+    rules = eqx.tree_at(lambda r: r.seeing.join_gap, rules, gap)
     log = without_unread_motions(log)
     with jax.enable_x64(True):
         given = config, camera, mount, log, path, segment_map, rules, priors

@@ -54,7 +54,7 @@ class Seeing(eqx.Module):
 
     gate: float = 3.0  # pixels that an end may be off its line
     angle: float = 0.15  # radians between a segment and its line in the image
-    join_gap: float = 0.1  # metres that a segment may lie beyond what was seen of its line
+    join_gap: float = 0.1  # camera heights that a segment may lie beyond what was seen of its line
 
 
 def associate(
