@@ -1,6 +1,7 @@
 """`sofjax run`: a drive in, a trajectory and a map out."""
 
 import argparse
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -70,10 +71,11 @@ def _calibrate(drive: "Drive", settings: "RunSettings", writer: "RunWriter") -> 
     """`--calibrate`: the drive with the rig that is fitted to it; None if it is not usable."""
     from sofjax import viewer
     from sofjax.pipeline import calibrate_drive, run_folder
-    from sofjax.pipeline.calibrate import IF_TOLD
+    from sofjax.pipeline.calibrate import FRONTEND, IF_TOLD
 
+    frontend = dataclasses.replace(settings.frontend, capacity=FRONTEND.capacity)
     with bar(len(drive.image_files), "segments") as progress:
-        found = calibrate_drive(drive, settings.frontend, progress=progress, more=IF_TOLD)
+        found = calibrate_drive(drive, frontend, progress=progress, more=IF_TOLD)
     print(summaries.of_calibration(found))
     if not found.usable:
         print("the drive is not run: measure the mount, or leave --calibrate out")

@@ -39,7 +39,8 @@ BY_DEFAULT = MOUNT[:3]
 # what a drive may tell beside them. Not the line delay: at a constant speed it is like a bent lens
 IF_TOLD = tuple(name for name in RIG if name not in (*BY_DEFAULT, "line_delay"))
 STANDS_STILL = 0.05  # metres and radians, below which a drive tells nothing of a rig
-FRONTEND = FrontendSettings()
+FRONTEND = FrontendSettings(capacity=256)  # a fit is sure by many lines, of which a run needs few
+STEP = 32  # capacities are multiples of it
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def calibrate_drive(
     _check_free((*free, *more), joint)
     _check_moves(drive)
     images = functools.partial(watched, progress=progress)
-    log = observe_drive(drive, Frontend.of(drive, frontend), images)
+    log = _narrowed(observe_drive(drive, Frontend.of(drive, frontend), images))
     config = _config(drive.camera_file, free, more)
     with jax.enable_x64(True):
         given, log = in_double((drive.camera_file.rig, log))
@@ -158,6 +159,14 @@ def calibrate_drive(
         covariance=covariance,
         fit=found,
     )
+
+
+def _narrowed(log: Observation) -> Observation:
+    """A log with no more room than its fullest image needs."""
+    most = int(np.asarray(log.segments_image.valid).sum(1).max())
+    room = max(STEP, -(-most // STEP) * STEP)
+    segments = jax.tree.map(lambda a: a[:, :room], log.segments_image)
+    return dataclasses.replace(log, segments_image=segments)
 
 
 def _config(file: CameraFile, free: tuple[str, ...], more: tuple[str, ...]) -> DriveFitConfig:
