@@ -80,7 +80,7 @@ class Rig(eqx.Module):
 
     camera: Camera
     mount: Mount
-    lens: Lens = Lens(jnp.zeros(8))
+    lens: Lens = dataclasses.field(default_factory=lambda: Lens(jnp.zeros(8)))
     time_offset: Float[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros(()))
     line_delay: Float[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros(()))
 
