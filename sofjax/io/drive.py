@@ -8,6 +8,7 @@ import numpy as np
 from sofjax.io.camera_file import CameraFile, read_camera
 from sofjax.io.contradictions import contradictions
 from sofjax.io.errors import InputError
+from sofjax.io.image_list import read_images
 from sofjax.io.numbers import MAX_SEGMENTS, check_segment
 from sofjax.io.odometry import (
     CLOSE,

@@ -5,6 +5,7 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import SupportsFloat
 
 import jax
 import jax.numpy as jnp
@@ -190,12 +191,19 @@ def _fitted_file(
         distortion = distortion + np.pad(by[:2], (0, len(distortion) - 2))
     if robot:
         sigma = np.sqrt(np.diag(covariance))
-        known = {k: float(sigma[UNKNOWNS.index(k)]) for k in found.free}
+        known = {k: _short(sigma[UNKNOWNS.index(k)]) for k in found.free}
         clock = RigFields(
-            float(rig.time_offset), float(rig.line_delay), tuple(map(float, found.fit.odometer)),
+            _short(rig.time_offset) if "time_offset" in moved else clock.time_offset,
+            _short(rig.line_delay) if "line_delay" in moved else clock.line_delay,
+            tuple(map(_short, found.fit.odometer)),
             {**clock.sigma, **known},
-        )  # fmt: skip
+        )
     return dataclasses.replace(file, camera=camera, mount=mount, distortion=distortion, clock=clock)
+
+
+def _short(value: SupportsFloat) -> float:
+    """A fitted number to the digits that it can have."""
+    return float(f"{float(value):.6g}")
 
 
 def _check_free(free: tuple[str, ...], joint: bool) -> None:
