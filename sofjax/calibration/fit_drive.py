@@ -85,6 +85,12 @@ class DriveFit:
     ends: Float[np.ndarray, "starts 3"]  # height, pitch, roll where each start ended
     agreeing: int  # how many of them ended in the same place
     known: Float[np.ndarray, "17 17"] | None = None  # covariance with the mount free in any case
+    # of a fit with all of `DriveFitConfig.more` free: what the drive tells of each by itself
+    all_free: Float[np.ndarray, "17 17"] | None = None
+    as_given: tuple[
+        str, ...
+    ] = ()  # what was held, as the drive tells it and does not contradict it
+    not_told: tuple[str, ...] = ()  # what was held, as the drive does not tell it
 
     @property
     def estimate(self) -> Estimate:
@@ -148,7 +154,9 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
     asked = {*config.fit.free, *config.more}
     for _ in refine:
         found = solved(found, found.estimate.by, {*asked, "distance"})
-    by, kept = contradicted(found.estimate.by, found.fit.covariance, found.free)
+    all_free = np.asarray(found.fit.covariance)
+    by, kept = contradicted(found.estimate.by, all_free, found.free)
+    as_given, not_told = _held(asked - kept - set(BIAS), all_free, config.fit.limit)
     kept |= set() if "height" in kept else {"distance"}
     by = np.where([name in kept for name in UNKNOWNS], by, 0.0)
     for _ in refine:
@@ -156,8 +164,19 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
         by = found.estimate.by
     # how well it is known, were it not given: apart from the scale, which no image tells
     free = ({*config.fit.free, *kept}) - {"distance"}
-    known = solved(found, by, free).fit.covariance
-    return replace(found, known=np.asarray(known))
+    known = np.array(solved(found, by, free).fit.covariance)
+    at = UNKNOWNS.index("distance")
+    known[at, at] = found.fit.covariance[at, at]  # for a height that is right
+    return replace(found, known=known, all_free=all_free, as_given=as_given, not_told=not_told)
+
+
+def _held(
+    names: set[str], all_free: Float[np.ndarray, "17 17"], limit: tuple[float, ...]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Those of what was held that the drive tells, and those that it does not."""
+    told = dict(zip(UNKNOWNS, np.sqrt(np.diag(all_free)) <= np.asarray(limit), strict=True))
+    held = [name for name in UNKNOWNS if name in names]
+    return tuple(n for n in held if told[n]), tuple(n for n in held if not told[n])
 
 
 def contradicted(
