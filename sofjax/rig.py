@@ -80,7 +80,7 @@ class Rig(eqx.Module):
 
     camera: Camera
     mount: Mount
-    lens: Lens = Lens(jnp.zeros(8))
+    lens: Lens = dataclasses.field(default_factory=lambda: Lens(jnp.zeros(8)))
     time_offset: Float[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros(()))
     line_delay: Float[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros(()))
 
@@ -105,7 +105,7 @@ def exposure(around: Float[Array, "L 3"], seconds: Float[Array, ""]) -> SE2:
     step = LAGS[1] - LAGS[0]
     at = jnp.clip((seconds - LAGS[0]) / step, 0, len(LAGS) - 1)
     i = jnp.clip(at.astype(int), 0, len(LAGS) - 2)
-    share = at - i
+    share = at - i.astype(at.dtype)
     return SE2.exp((1 - share) * around[i] + share * around[i + 1])
 
 

@@ -6,22 +6,43 @@ import numpy as np
 from conftest import jit_quickly
 
 from sofjax.calibration import (
+    UNKNOWNS,
     FitConfig,
     PairNoise,
+    Seen,
     SegmentPairs,
+    distances,
     expected,
+    fit_rig,
+    start_at,
 )
-from sofjax.calibration import fit_mount as compiled_well
-from sofjax.calibration.pairs import start_at
 from sofjax.geometry import SE2, Mount, projection_matrix
+from sofjax.rig import Rig
 
 N = 96
 MOUNT = (0.05, 0.0, 0.6, 0.26, 0.02, 0.0)  # x, y, height, pitch, roll, yaw
 
 
-@jit_quickly
-def fit_mount(camera, mount, pairs, config=None):
-    return compiled_well(camera, mount, pairs, config or FitConfig())
+def begin(camera, mount):
+    return start_at(Rig(camera, mount))
+
+
+def fit_from(camera, mount, pairs, config=None):
+    """A fit that begins at a mount, everything else of the rig as it is; compiled well."""
+    return fit_rig(begin(camera, mount), pairs, config or FitConfig())
+
+
+fit_mount = jit_quickly(fit_from)
+
+
+def changes(**by):
+    """A change [17] of some of the unknowns, by name."""
+    return jnp.array([by.pop(name, 0.0) for name in UNKNOWNS])
+
+
+def off_by(estimate, first, second, T):
+    """The distances of one pair, whose images were taken at their stamps by the given lens."""
+    return distances(estimate, Seen(first, second, T))
 
 
 FIT = {"height": 0.6, "pitch": 0.26, "roll": 0.02}
@@ -84,7 +105,7 @@ def make_pairs(camera, mount, rng, motion=None, angle=None, noise=0.0, z=0.0):
 
 def weighed(camera, mount, pairs, **noise):
     return eqx.tree_at(
-        lambda p: p.sigma, pairs, expected(PairNoise(**noise), camera, start_at(mount), pairs)
+        lambda p: p.sigma, pairs, expected(PairNoise(**noise), begin(camera, mount), pairs)
     )
 
 

@@ -15,7 +15,7 @@ EXPERIMENTS = PACKAGE.parent / "experiments"
 
 # each room imports from those before it; to add one is to say where it stands
 ROOMS = """
-    _checks _pytree geometry extraction motion likelihood particles segment_map slam smoothing
+    _checks _pytree geometry extraction motion rig likelihood particles segment_map slam smoothing
     loop_closure calibration io vision evaluation simulation viewer pipeline cli
 """.split()
 CORE = ROOMS[: ROOMS.index("io")]

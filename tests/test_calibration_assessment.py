@@ -7,16 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from line_pairs import N, fit_mount, make_pairs, true_mount, value, weighed
+from line_pairs import N, begin, changes, fit_mount, make_pairs, true_mount, value, weighed
 
-from sofjax.calibration import (
-    FitConfig,
-    PairNoise,
-)
+from sofjax.calibration import UNKNOWNS, FitConfig, PairNoise
 from sofjax.calibration.assessment import FitOutcome, ambiguity, assess, doubts
 from sofjax.calibration.fit_drive import DriveFitConfig
 from sofjax.calibration.floor_test import FloorTestConfig, lies_on_floor
-from sofjax.calibration.pairs import Estimate, start_at
 from sofjax.calibration.tracks import TrackConfig
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -41,12 +37,12 @@ def test_an_odometer_put_far_off_its_prior_widens_all_error_bars(camera, mount, 
     short = eqx.tree_at(
         lambda p: p.T_first_second,
         pairs,
-        jax.vmap(Estimate(mount, jnp.array([0.0, -0.3, 0.0, 0.0])).motion)(pairs.T_first_second),
+        jax.vmap(begin(camera, mount).moved(changes(left=-0.3)).motion)(pairs.T_first_second),
     )
     config = FitConfig(free=("height", "pitch", "roll", "left"))
     right, wrong = (fit_mount(camera, mount, p, config) for p in (pairs, short))
     assert float(right.birge_ratio) == 1 and doubts(right) == ""
-    sigmas = float(wrong.odometer[1]) / config.prior_sigma[5]
+    sigmas = float(wrong.odometer[1]) / config.prior_sigma[UNKNOWNS.index("left")]
     assert float(wrong.birge_ratio) == pytest.approx(abs(sigmas)) and sigmas > 5
     assert "clock or odometer" in doubts(wrong)
     ratio = np.sqrt(np.diag(wrong.covariance)[:3] / np.diag(right.covariance)[:3])
@@ -93,14 +89,12 @@ def test_what_stands_above_the_floor_is_told_by_its_height(camera, mount, rng):
     z = np.where(np.arange(N) // 6 % 3 == 0, 0.1, 0.0)  # six pairs of each line
     pairs = weighed(camera, mount, make_pairs(camera, mount, rng, noise=0.3, z=z))
     line = jnp.arange(N) // 6
-    floor = np.asarray(lies_on_floor(FloorTestConfig(), camera, start_at(mount), pairs, line))
+    floor = np.asarray(lies_on_floor(FloorTestConfig(), begin(camera, mount), pairs, line))
     assert floor[z == 0].mean() > 0.9 and floor[z > 0].mean() < 0.3
     wild = eqx.tree_at(
         lambda p: p.second, pairs, pairs.second + jnp.asarray(rng.normal(0, 15, (N, 2, 2)))
     )
-    assert not np.asarray(
-        lies_on_floor(FloorTestConfig(), camera, start_at(mount), wild, line)
-    ).any()
+    assert not np.asarray(lies_on_floor(FloorTestConfig(), begin(camera, mount), wild, line)).any()
 
 
 @pytest.mark.parametrize(
@@ -108,8 +102,8 @@ def test_what_stands_above_the_floor_is_told_by_its_height(camera, mount, rng):
     [
         (lambda: FitConfig(free=("pitch", "heigth")), "FitConfig.free must be some of height"),
         (lambda: FitConfig(min_pairs=0), "FitConfig.min_pairs must be a whole number from 1"),
-        (lambda: FitConfig(limit=(0.05, 0.02)), "FitConfig.limit must be 8 numbers above 0"),
-        (lambda: FitConfig(prior_sigma=(-1.0,) * 8), "FitConfig.prior_sigma must be 8 numbers"),
+        (lambda: FitConfig(limit=(0.05, 0.02)), "FitConfig.limit must be 17 numbers above 0"),
+        (lambda: FitConfig(prior_sigma=(-1.0,) * 17), "FitConfig.prior_sigma must be 17 numbers"),
         (lambda: FloorTestConfig(max_rms=0.0), "FloorTestConfig.max_rms must be a number above 0"),
         (lambda: TrackConfig(max_lag=0), "TrackConfig.max_lag must be a whole number from 1"),
         (lambda: PairNoise(pixel_sigma=-0.5), "PairNoise.pixel_sigma must be a number from 0"),

@@ -5,9 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from line_pairs import FIT, fit_mount, off, seen, true_mount, value
+from line_pairs import FIT, begin, fit_mount, off, seen, true_mount, value
 
-from sofjax.calibration.pairs import start_at
 from sofjax.calibration.tracks import TrackConfig, follow, relate
 from sofjax.extraction.observation import Observation
 from sofjax.geometry import SE2, Segments
@@ -45,7 +44,7 @@ def log(camera, mount, rng):
 
 def test_lines_are_followed_though_missed_once_and_the_mount_is_rough(camera, mount, log):
     log, order = log
-    track = follow(TrackConfig(), camera, start_at(off(mount, 1.25, 0.1)), log)
+    track = follow(TrackConfig(), begin(camera, off(mount, 1.25, 0.1)), log)
     assert (track[:, 12:] == -1).all() and (track[20] == -1).sum() == 5
     of_line = np.where(track[:, :12] >= 0, track[:, :12], 0)
     for t in range(1, 40):
@@ -61,7 +60,7 @@ def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
     log, _ = log
     config = TrackConfig()
     unread = dataclasses.replace(log, motion_sigma=jnp.zeros((40, 3)).at[20].set(0.1))
-    track = follow(config, camera, start_at(mount), unread)
+    track = follow(config, begin(camera, mount), unread)
     before, behind = (np.unique(part[part >= 0]) for part in (track[:20], track[20:]))
     assert len(before) == 12 and not np.intersect1d(before, behind).size
     known = without_unread_motions(log)
@@ -76,7 +75,7 @@ def test_nothing_is_followed_over_a_motion_that_nobody_read(camera, mount, log):
 
 def test_pairs_are_nested_and_use_each_segment_once(camera, mount, log):
     log, _ = log
-    track = follow(TrackConfig(), camera, start_at(mount), log)
+    track = follow(TrackConfig(), begin(camera, mount), log)
     pairs, line = relate(TrackConfig(), log, track, 0.6, 256)
     valid = np.asarray(pairs.valid)
     assert valid.sum() > 60 and len(np.unique(np.asarray(line)[valid])) == 12

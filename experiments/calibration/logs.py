@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sofjax.calibration import SegmentPairs, distances, start_at
+from sofjax.calibration import Estimate, Seen, SegmentPairs, distances, start_at
 from sofjax.extraction import Observation
 from sofjax.geometry import SE2, Camera, Mount
 from sofjax.motion import MotionModel
+from sofjax.rig import Rig
 from sofjax.simulation import (
     Detection,
     Odometer,
@@ -58,14 +59,18 @@ def roughly(mount: Mount) -> Mount:
     )
 
 
+def moved(camera: Camera, mount: Mount, by: jax.Array) -> Estimate:
+    """The rig of a camera and a mount, with log height, pitch and roll changed."""
+    start = start_at(Rig(camera, mount))
+    return start.moved(jnp.zeros_like(start.by).at[:3].set(by))
+
+
 @eqx.filter_jit
 def cramer_rao(camera: Camera, mount: Mount, pairs: SegmentPairs, noise: jax.Array) -> jax.Array:
     """Least standard deviations of (height, pitch, roll) from these pairs, every line unknown."""
 
     def one(first: jax.Array, second: jax.Array, T: SE2) -> jax.Array:
-        of = lambda by, a, b: distances(
-            camera, start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])), a, b, T
-        )[:2]
+        of = lambda by, a, b: distances(moved(camera, mount, by), Seen(a, b, T))[:2]
         J, a, b = jax.jacfwd(of, (0, 1, 2))(jnp.zeros(3), first, second)
         by_ends = jnp.concatenate([a.reshape(2, 4), b.reshape(2, 4)], axis=1)
         return J.T @ jnp.linalg.solve(noise**2 * by_ends @ by_ends.T, J)

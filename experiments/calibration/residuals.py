@@ -18,15 +18,15 @@ import optimistix as optx
 
 sys.path.append(str(Path(__file__).parents[1]))
 import common
-from logs import EXACT_MODEL, cramer_rao, make_log, roughly
+from logs import EXACT_MODEL, cramer_rao, make_log, moved, roughly
 
 from sofjax.calibration import (
     PairNoise,
     SegmentPairs,
     TrackConfig,
-    distances,
+    all_distances,
     expected,
-    fit_mount,
+    fit_rig,
     follow,
     relate,
     start_at,
@@ -41,6 +41,7 @@ from sofjax.geometry import (
     transfer_line,
     two_view_homography,
 )
+from sofjax.rig import Rig
 from sofjax.simulation import make_world
 from sofjax.smoothing import robust
 
@@ -55,8 +56,8 @@ def polar_fit(
     centre = jnp.eye(3).at[:2, 2].set(-camera.K[:2, 2])
 
     def one(by: jax.Array, first: jax.Array, second: jax.Array, T: SE2) -> jax.Array:
-        moved = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])).mount
-        H = centre @ two_view_homography(camera, moved, T) @ jnp.linalg.inv(centre)
+        there = moved(camera, mount, by).rig.mount
+        H = centre @ two_view_homography(camera, there, T) @ jnp.linalg.inv(centre)
         ends = lambda s: s - camera.K[:2, 2]
         carried = transfer_line(H, line_through(*ends(first)))
         return polar_difference(polar(line_through(*ends(second))), polar(carried)) / sigma
@@ -69,15 +70,16 @@ def polar_fit(
     by = optx.least_squares(residuals, solver, jnp.zeros(3), max_steps=60, throw=False).value
     J = jax.jacfwd(residuals)(by, None)
     C = jnp.linalg.inv(jnp.einsum("nri,nrj->ij", J, J) + 1e-9 * jnp.eye(3))
-    m = start_at(mount).moved(jnp.concatenate([by, jnp.zeros(5)])).mount
+    m = moved(camera, mount, by).rig.mount
     unit = jnp.stack([m.height, jnp.ones(()), jnp.ones(())])
     return jnp.stack([m.height, m.pitch, m.roll]), C * jnp.outer(unit, unit)
 
 
 def endpoint_fit(camera: Camera, mount: Mount, pairs: SegmentPairs) -> tuple[jax.Array, jax.Array]:
-    found = fit_mount(camera, mount, pairs)
+    found = fit_rig(start_at(Rig(camera, mount)), pairs)
     m = found.mount
-    return jnp.stack([m.height, m.pitch, m.roll]), found.covariance[:3, :3]
+    unit = jnp.stack([m.height, jnp.ones(()), jnp.ones(())])
+    return jnp.stack([m.height, m.pitch, m.roll]), found.covariance[:3, :3] * jnp.outer(unit, unit)
 
 
 def fit_all(
@@ -101,15 +103,14 @@ def study(seed: int) -> tuple[dict, np.ndarray, int, float] | None:
     rules = TrackConfig()
     noise = PairNoise(pixel_sigma=NOISE, odometer=EXACT_MODEL)
     # a wrong mount prefers pairs that seem to prove it: that is not what is asked here
-    track = follow(rules, camera, start_at(mount), log)
+    true_rig = start_at(Rig(camera, mount))
+    track = follow(rules, true_rig, log)
     pairs, _ = relate(rules, log, track, float(rough.height), CAPACITY)
     if pairs.valid.sum() < 60:
         return None
     # false tracks are the same for all residuals; here there are to be none
-    sigma = expected(noise, camera, start_at(mount), pairs)
-    off = jax.vmap(distances, (None, None, 0, 0, 0))(
-        camera, start_at(mount), pairs.first, pairs.second, pairs.T_first_second
-    )
+    sigma = expected(noise, true_rig, pairs)
+    off = all_distances(true_rig, pairs)
     true = pairs.valid & (jnp.abs(off / sigma).max(axis=1) < 5)
     pairs = eqx.tree_at(lambda p: (p.sigma, p.valid), pairs, (sigma, true))
     plain = eqx.tree_at(lambda p: p.sigma, pairs, jnp.full_like(sigma, NOISE * 2**0.5))

@@ -21,6 +21,7 @@ import common
 from logs import EXACT, EXACT_MODEL, cramer_rao, make_log, roughly
 
 from sofjax.calibration import TURNS, DriveFitConfig, FitConfig, PairNoise, TrackConfig, fit_drive
+from sofjax.rig import Rig
 from sofjax.simulation import Odometer, World, around, furnish, make_world
 
 NOISE, CAPACITY = 0.5, 1024
@@ -82,7 +83,7 @@ def study(setting: Setting, seed: int) -> dict:
     world = corridor(setting.floor, seed) if setting.floor else make_world("random", seed)
     camera, mount, log = make_log(world, seed, setting.noise, setting.odometer)
     rules = fit_rules(setting)
-    found = fit_drive(camera, roughly(mount), log, rules)
+    found = fit_drive(Rig(camera, roughly(mount)), log, rules)
     verdict = found.verdict(rules)
     best = float(setting.odometer.distance) * mount.height  # all that can be seen of it
     true = np.array([best, mount.pitch, mount.roll])
@@ -96,7 +97,7 @@ def study(setting: Setting, seed: int) -> dict:
         "pairs": int(found.pairs.valid.sum()),
         "height": float(mount.height),
         "error": error.tolist(),
-        "sigma": np.sqrt(np.diag(found.covariance))[:3].tolist(),
+        "sigma": (np.sqrt(np.diag(found.covariance))[:3] * [float(m.height), 1, 1]).tolist(),
         "bound": np.asarray(least).tolist(),
     }
 

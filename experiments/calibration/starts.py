@@ -47,8 +47,9 @@ def main() -> None:
     drive = read_drive(options.drive)
     log = observe_drive(drive, Frontend(drive.camera_file))
     double = lambda leaf: jnp.asarray(leaf, float if leaf.dtype.kind == "f" else leaf.dtype)
-    given = (drive.camera_file.camera, drive.camera_file.mount, log)
-    camera, mount, log = jax.tree.map(lambda leaf: double(np.asarray(leaf)), given)
+    given = (drive.camera_file.rig, log)
+    rig, log = jax.tree.map(lambda leaf: double(np.asarray(leaf)), given)
+    mount = rig.mount
     rules = dataclasses.replace(RULES, starts=RULES.starts[: options.each])
     told = np.array([mount.height * options.scale, mount.pitch, mount.roll], float)
     unit = np.array([told[0] / 100, np.pi / 180, np.pi / 180])
@@ -60,7 +61,7 @@ def main() -> None:
                 mount, height=mount.height * times, pitch=mount.pitch + more
             )
             begun = time.process_time()
-            found = fit_drive(camera, begin, log, rules)
+            found = fit_drive(dataclasses.replace(rig, mount=begin), log, rules)
             m, seconds = found.fit.mount, time.process_time() - begun
             end = np.array([m.height, m.pitch, m.roll])
             off = (end - told) / unit
@@ -68,7 +69,7 @@ def main() -> None:
             row = [float(begin.height), float(begin.pitch)]
             rows.append({"begin": row, "end": end, "off": off, "usable": verdict.usable,
                          "why": verdict.sentence,
-                         "sigma": np.sqrt(np.diag(found.covariance))[:3],
+                         "sigma": np.sqrt(np.diag(found.covariance))[:3] * [end[0], 1, 1],
                          "odometer": found.fit.odometer,
                          "processor_seconds": seconds})  # fmt: skip
             print(f"{row[0]:.3f} m, {np.degrees(row[1]):5.1f}°  {end[0]:.4f} m, "

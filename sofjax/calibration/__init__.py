@@ -15,6 +15,7 @@ from sofjax.calibration.pairs import Estimate as Estimate
 from sofjax.calibration.pairs import PairNoise as PairNoise
 from sofjax.calibration.pairs import Seen as Seen
 from sofjax.calibration.pairs import SegmentPairs as SegmentPairs
+from sofjax.calibration.pairs import all_distances as all_distances
 from sofjax.calibration.pairs import distances as distances
 from sofjax.calibration.pairs import expected as expected
 from sofjax.calibration.pairs import start_at as start_at

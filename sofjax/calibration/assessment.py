@@ -140,12 +140,13 @@ def grade(covariance: Float[np.ndarray, "17 17"]) -> str:
     return "not usable"
 
 
-def accuracy(covariance: Float[np.ndarray, "17 17"], free: tuple[str, ...]) -> str:
-    """How well each of height, pitch and roll is known, if it was free."""
-    sigma = np.sqrt(np.diag(covariance))
-    known = [f"{name} to {_shown(name, sigma[i])}" for i, name in enumerate(MOUNT[:3])
-             if name in free and sigma[i]]  # fmt: skip
-    return "known " + ", ".join(known) + ", apart from the odometer's scale"
+def accuracy(covariance: Float[np.ndarray, "17 17"]) -> str:
+    """How well each of height, pitch and roll is known; if none of them is fitted, what is."""
+    sigma = dict(zip(UNKNOWNS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    fitted = [name for name in UNKNOWNS if name not in TURNS and sigma[name]]
+    known = [name for name in fitted if name in MOUNT[:3]] or fitted
+    said = ", ".join(f"{_SHOWN[name][0]} to {_shown(name, sigma[name])}" for name in known)
+    return f"known {said}, apart from the odometer's scale"
 
 
 def estimates(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,6 +33,7 @@ from sofjax.rig import Rig
 # where to begin: at the mount given, and far from it
 STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
 
+STEPS = 12  # of a round's solver, at most: the next round goes on
 CONTRADICTED = 4.0  # standard deviations from which a number that was given is another
 
 
@@ -83,19 +85,27 @@ class DriveFit:
     related: int  # pairs before those off the floor were left out
     free: tuple[str, ...]  # what was fitted in the end
     ends: Float[np.ndarray, "starts 3"]  # height, pitch, roll where each start ended
-    agreeing: int  # how many of them ended in the same place
+    same: Float[np.ndarray, "agreeing 3"]  # those of them that ended in the same place
     known: Float[np.ndarray, "17 17"] | None = None  # covariance with the mount free in any case
+    as_given: tuple[str, ...] = ()  # held: the drive tells them and does not contradict them
+    not_told: tuple[str, ...] = ()  # what was held, as the drive does not tell it
 
     @property
     def estimate(self) -> Estimate:
         return self.fit.estimate
 
     @property
+    def agreeing(self) -> int:
+        """How many starts ended in the same place."""
+        return len(self.same)
+
+    @property
     def covariance(self) -> Float[np.ndarray, "17 17"]:
-        """The covariance of the fit, plus the spread of where the starts ended."""
+        """The covariance of the fit, plus the spread of where the agreeing starts ended."""
         spread = np.zeros((U, U))
         height = float(self.fit.mount.height)
-        spread[:3, :3] = np.cov((self.ends / [height, 1, 1]).T, bias=True)
+        if len(self.same) > 1:
+            spread[:3, :3] = np.cov((self.same / [height, 1, 1]).T, bias=True)
         return np.asarray(self.fit.covariance if self.known is None else self.known) + spread
 
     def verdict(self, config: DriveFitConfig) -> Assessment:
@@ -122,14 +132,15 @@ def fit_drive(given: Rig, log: Observation, config: DriveFitConfig | None = None
     log = without_unread_motions(log)
     searched = [_search(start, log, config) for start in starts(given, config)]
     ends = np.array([_place(found.fit.mount) for found in searched])
-    agreeing = (_distance(ends[:, None], ends, config) < 1).all(-1).sum(1)
-    best = int(np.lexsort((-np.array([f.pairs.valid.sum() for f in searched]), -agreeing))[0])
+    alike = (_distance(ends[:, None], ends, config) < 1).all(-1)
+    count = np.array([f.pairs.valid.sum() for f in searched])
+    best = int(np.lexsort((-count, -alike.sum(1)))[0])
     found = searched[best]
     for _ in range(config.refine_rounds):
         found = _round(found.estimate, log, config, test_floor=True)
     if config.more:
         found = _freed(found, log, config)
-    return replace(found, ends=ends, agreeing=int(agreeing[best]))
+    return replace(found, ends=ends, same=ends[alike[best]])
 
 
 def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFit:
@@ -138,26 +149,60 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
     Height and the odometer's distance are one gauge: the height holds as long as an odometer that
     errs as odometers do explains the images with it.
     """
-    refine = range(config.refine_rounds)
 
     def solved(start: DriveFit, by: ArrayLike, free: Iterable[str]) -> DriveFit:
         free = tuple(name for name in UNKNOWNS if name in {*free, *TURNS})
         estimate = Estimate(start.estimate.given, jnp.asarray(by))
         return _round(estimate, log, config, test_floor=True, free=free)
 
-    asked = {*config.fit.free, *config.more}
-    for _ in refine:
-        found = solved(found, found.estimate.by, {*asked, "distance"})
+    mount, more = {*config.fit.free}, {*config.more} - {*config.fit.free}
+    kept: set[str] = set()
+    while tried := _freed_one_by_one(found, config, more - kept):
+        name = max(tried, key=lambda name: tried[name].contradicted)
+        if tried[name].contradicted < CONTRADICTED:
+            break
+        kept.add(name)
+        found = solved(found, found.estimate.by, mount | kept)
+    found = solved(found, found.estimate.by, mount | kept | {"distance"})
     by, kept = contradicted(found.estimate.by, found.fit.covariance, found.free)
     kept |= set() if "height" in kept else {"distance"}
     by = np.where([name in kept for name in UNKNOWNS], by, 0.0)
-    for _ in refine:
+    for _ in range(config.refine_rounds):
         found = solved(found, by, kept)
         by = found.estimate.by
     # how well it is known, were it not given: apart from the scale, which no image tells
-    free = ({*config.fit.free, *kept}) - {"distance"}
-    known = solved(found, by, free).fit.covariance
-    return replace(found, known=np.asarray(known))
+    known = np.asarray(solved(found, by, (mount | kept) - {"distance"}).fit.covariance)
+    limit = dict(zip(UNKNOWNS, config.fit.limit, strict=True))
+    sigma = dict(zip(UNKNOWNS, np.sqrt(np.diag(known)).tolist(), strict=True))
+    sigma |= {name: one.sigma for name, one in tried.items()}
+    held = [name for name in UNKNOWNS if name in (mount | more) - kept - {*TURNS}]
+    return replace(
+        found, known=known,
+        as_given=tuple(name for name in held if sigma[name] <= limit[name]),
+        not_told=tuple(name for name in held if sigma[name] > limit[name]),
+    )  # fmt: skip
+
+
+class Tried(NamedTuple):
+    """One more number of a fit freed."""
+
+    sigma: float  # its standard deviation
+    contradicted: float  # standard deviations by which it is another than it was given
+
+
+def _freed_one_by_one(
+    found: DriveFit, config: DriveFitConfig, names: set[str]
+) -> dict[str, Tried]:
+    """Each of the numbers freed beside those of a fit, with its associations."""
+    tried = {}
+    for name in sorted(names):
+        i = UNKNOWNS.index(name)
+        fit = fit_rig(
+            found.estimate, found.pairs, replace(config.fit, free=(*found.free, name)), STEPS
+        )
+        sigma = max(float(fit.covariance[i, i]) ** 0.5, 1e-12)
+        tried[name] = Tried(sigma, abs(float(fit.estimate.by[i])) / sigma)
+    return tried
 
 
 def contradicted(
@@ -236,5 +281,5 @@ def _round(
     if test_floor:
         floor = lies_on_floor(config.floor, estimate, pairs, line)
         pairs = eqx.tree_at(lambda p: p.valid, pairs, floor)
-    fit = fit_rig(estimate, pairs, replace(config.fit, free=free))
-    return DriveFit(fit, pairs, line, related, free, np.zeros((0, 3)), 0)
+    fit = fit_rig(estimate, pairs, replace(config.fit, free=free), STEPS)
+    return DriveFit(fit, pairs, line, related, free, np.zeros((0, 3)), np.zeros((0, 3)))

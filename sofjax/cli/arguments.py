@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from sofjax.cli import arguments_simulate
-from sofjax.pipeline.outcomes import FREE, LOOPS
+from sofjax.pipeline.outcomes import FREE, LOOPS, OF_MOUNT
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[Any]
@@ -181,7 +181,7 @@ def _calibrate_robot(parts: "Commands") -> None:
         "odometer's errors in turning, and what the drive contradicts of the others, but for the "
         "line delay, which wants turns at several speeds, and the distance, which is the measure",
     )
-    parser.set_defaults(command="calibrate robot", joint=False)
+    parser.set_defaults(command="calibrate robot", joint=False, robot=True)
 
 
 def _calibrate_mount(parts: "Commands") -> None:
@@ -196,7 +196,7 @@ def _calibrate_mount(parts: "Commands") -> None:
         "--free",
         metavar="height,pitch,...",
         default=BY_DEFAULT,
-        help=f"what to fit, of {', '.join(FREE)} (the last four are "
+        help=f"what to fit, of {', '.join(OF_MOUNT)} (the last four are "
         f"the odometer's errors, and those in turning are always free); default {BY_DEFAULT}",
     )
     parser.add_argument(
@@ -204,7 +204,7 @@ def _calibrate_mount(parts: "Commands") -> None:
         action="store_true",
         help="then solve all poses, lines, their heights and the mount together",
     )
-    parser.set_defaults(command="calibrate mount")
+    parser.set_defaults(command="calibrate mount", robot=False)
 
 
 def _add_drive_fit(parser: argparse.ArgumentParser) -> None:

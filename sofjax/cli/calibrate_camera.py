@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sofjax.cli import summaries
 from sofjax.cli.progress import bar
 from sofjax.io.errors import InputError, quoted
 
@@ -53,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"drawn to {figure}")
     else:
         print(viewer.MISSING)
+    if verdict.usable:
+        print(summaries.next_command("calibrate robot", put=args.out))
     return 0 if verdict.usable else REFUSED
 
 

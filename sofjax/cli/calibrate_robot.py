@@ -8,7 +8,7 @@ from sofjax.cli import summaries
 from sofjax.cli.arguments import BY_DEFAULT
 from sofjax.cli.progress import bar
 from sofjax.io.errors import InputError, nearest, quoted
-from sofjax.pipeline.outcomes import FREE
+from sofjax.pipeline.outcomes import FREE, OF_MOUNT, OF_RIG
 
 if TYPE_CHECKING:
     from sofjax.io.drive import Drive
@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     from sofjax.pipeline import calibrate_drive, figures, run_folder
     from sofjax.pipeline.calibrate import IF_TOLD
 
-    free = free_names(BY_DEFAULT if args.free is None else args.free)
+    free = free_names(BY_DEFAULT if args.free is None else args.free, args.robot)
     if args.joint and "distance" in free:
         raise InputError("--joint keeps the odometer's distances; leave 'distance' out of --free")
     if args.out.is_dir():
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     with bar(len(drive.image_files), "segments") as progress:
         found = calibrate_drive(
             drive, free=free, joint=args.joint, progress=progress,
-            more=IF_TOLD if args.free is None else (),
+            more=IF_TOLD if args.free is None else (), robot=args.robot,
         )  # fmt: skip
     print(summaries.of_calibration(found))
     if found.usable:
@@ -48,17 +48,21 @@ def run(args: argparse.Namespace) -> int:
         print(viewer.MISSING)
     elif figures.draw_calibration(figure, found):
         print(f"drawn to {figure}")
+    if found.usable:
+        print(summaries.next_command("run", args.drive, put=args.out))
     return 0 if found.usable else REFUSED
 
 
-def free_names(text: str) -> tuple[str, ...]:
-    """The names of --free, checked."""
+def free_names(text: str, robot: bool = False) -> tuple[str, ...]:
+    """The names of --free, checked: those of `calibrate robot` or of `calibrate mount`."""
+    known, some = (FREE, OF_RIG) if robot else (OF_MOUNT, OF_MOUNT[:4])
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     for name in names:
-        if name not in FREE:
-            raise InputError(f"--free: there is no {quoted(name)}; {nearest(name, FREE)}")
-    if not set(names) & set(FREE[:4]):
-        raise InputError("--free: one of height, pitch, roll and yaw at least must be free")
+        if name not in known:
+            raise InputError(f"--free: there is no {quoted(name)}; {nearest(name, known)}")
+    if not set(names) & set(some):
+        few = ", ".join(some[:-1])
+        raise InputError(f"--free: one of {few} and {some[-1]} at least must be free")
     return names
 
 

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sofjax.cli import summaries
 from sofjax.cli.progress import bar
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"drawn to {out}")
     else:
         print(f"sofjax: {viewer.MISSING}", file=sys.stderr)
+    print(summaries.next_command("calibrate robot" if found.contradictions else "run", args.drive))
     return DOUBTFUL if found.contradictions else 0
 
 

@@ -42,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
                 drive, settings, writer=writer, frontend=frontend, progress=progress, begun=begun
             )
         print(summaries.of_run(writer.folder, result))
+        if writer.folder is not None and not result.stopped:
+            print(summaries.after_run(writer.folder, drive))
         return stopping.exit_code() if result.stopped else 0
 
 
@@ -75,7 +77,7 @@ def _calibrate(drive: "Drive", settings: "RunSettings", writer: "RunWriter") -> 
 
     frontend = dataclasses.replace(settings.frontend, capacity=FRONTEND.capacity)
     with bar(len(drive.image_files), "segments") as progress:
-        found = calibrate_drive(drive, frontend, progress=progress, more=IF_TOLD)
+        found = calibrate_drive(drive, frontend, progress=progress, more=IF_TOLD, robot=True)
     print(summaries.of_calibration(found))
     if not found.usable:
         print("the drive is not run: measure the mount, or leave --calibrate out")

@@ -1,16 +1,19 @@
 """What was found, in a few lines for a person."""
 
 import math
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sofjax.evaluation import MapErrors, TrajectoryErrors
+    from sofjax.io.drive import Drive
     from sofjax.pipeline import Calibration, DriveResult
     from sofjax.pipeline.stages import Closed
 
 FULL = 0.99  # share of the true path, below which it is said
 FEW = 3  # files that are named
+CAMERA = "camera.yaml"
 
 ROWS = (
     ("ate_m", "position, root mean square", "{:.3f} m"),
@@ -66,7 +69,7 @@ def _closing(closed: "Closed | None") -> list[str]:
 
 
 def of_calibration(found: "Calibration") -> str:
-    """A fitted mount."""
+    """A fitted rig."""
     from sofjax.calibration.assessment import SCALE
 
     drive, fit = found.drive, found.fit
@@ -74,12 +77,43 @@ def of_calibration(found: "Calibration") -> str:
     lines = [
         f"{drive.name}: {len(drive.image_files)} images, {path:.1f} m, {found.evidence}",
         *(f"  {line}" for line in found.estimates),
+        *_held(found),
         f"  residual  {found.residual_px:.2f} px, root mean square",
         f"  starts    {fit.agreeing} of {len(fit.ends)} end in the same place",
         f"  scale     {SCALE}",
         f"  verdict   {found.verdict}: {found.sentence}",
     ]
     return "\n".join(lines)
+
+
+def _held(found: "Calibration") -> list[str]:
+    """What was held as it was given, and why, in a line each."""
+    fit, lines = found.fit, []
+    if fit.as_given:
+        lines.append(f"  as given  {', '.join(fit.as_given)} (nothing contradicts them)")
+    if fit.not_told:
+        lines.append(f"  not told  {', '.join(fit.not_told)}, as given (not told by this drive)")
+    return lines
+
+
+def next_command(command: str, drive: Path | None = None, put: Path | None = None) -> str:
+    """What to type next, in a line.
+
+    **Arguments:**
+    - `drive`: the folder to type it for; DRIVE if none is known.
+    - `put`: a camera file that must lie in that folder before.
+    """
+    folder = "DRIVE" if drive is None else shlex.quote(str(drive))
+    then = f"sofjax {command} {folder}"
+    if put is None or (drive is not None and put.resolve() == (drive / CAMERA).resolve()):
+        return f"next: {then}"
+    return f"next: cp {shlex.quote(str(put))} {folder}/{CAMERA}, then {then}"
+
+
+def after_run(folder: Path, drive: "Drive") -> str:
+    """What to type after a run; without the truth there is nothing to compare it with."""
+    then = f"next: sofjax evaluate {shlex.quote(str(folder))}"
+    return then if drive.groundtruth else f"{then}, once its drive has a groundtruth.txt"
 
 
 def errors_table(

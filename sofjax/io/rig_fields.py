@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sofjax.io.camera_forms import mapping, number
-from sofjax.io.errors import InputError, nearest
+from sofjax.io.errors import InputError, nearest, quoted
 from sofjax.motion import BIAS
 from sofjax.rig import RIG
 
@@ -57,8 +57,8 @@ def rig_lines(rig: RigFields) -> str:
     """Their lines in a camera file; none of what is zero or not known."""
     odometer = dict(zip(BIAS, rig.odometer, strict=True)) if any(rig.odometer) else {}
     values = {
-        "time_offset": f"{rig.time_offset:.6g}" if rig.time_offset else "",
-        "line_delay": f"{rig.line_delay:.6g}" if rig.line_delay else "",
+        "time_offset": repr(rig.time_offset) if rig.time_offset else "",
+        "line_delay": repr(rig.line_delay) if rig.line_delay else "",
         "odometer": _flow(odometer),
         "sigma": _flow(rig.sigma),
     }
@@ -66,7 +66,7 @@ def rig_lines(rig: RigFields) -> str:
 
 
 def _flow(values: Mapping[str, float]) -> str:
-    inside = ", ".join(f"{name}: {value:.6g}" for name, value in values.items())
+    inside = ", ".join(f"{name}: {value!r}" for name, value in values.items())
     return f"{{{inside}}}" if inside else ""
 
 
@@ -83,10 +83,13 @@ def _within(path: Path, fields: Mapping, key: str, limit: float, unit: str) -> f
 
 def _numbers(path: Path, fields: Mapping, key: str, names: tuple[str, ...]) -> dict[str, float]:
     where = f"{path}: '{key}'"
-    given = mapping(where, fields.get(key) or {})
+    value = fields.get(key)
+    given = mapping(where, {} if value is None else value)
     for name in given:
         if name not in names:
-            raise InputError(f"{where} has no field {name!r}; {nearest(str(name), names)}")
+            raise InputError(
+                f"{where} has no field {quoted(str(name))}; {nearest(str(name), names)}"
+            )
     found = {name: number(f"{where}: '{name}'", value) for name, value in given.items()}
     assert all(map(math.isfinite, found.values()))
     return found

@@ -5,6 +5,7 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import SupportsFloat
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +87,8 @@ class Calibration:
             "before": {k: float(getattr(self.drive.camera_file.mount, k)) for k in MOUNT},
             "after": {k: float(getattr(self.camera_file.mount, k)) for k in MOUNT},
             "fitted": list(self.fit.free),
+            "as_given": list(self.fit.as_given),
+            "not_told": list(self.fit.not_told),
             "changed_by": {k: float(by[UNKNOWNS.index(k)]) for k in self.fit.free},
             "sigma": {k: float(s) * unit.get(k, 1.0) for k, s in zip(UNKNOWNS, sigma, strict=True)},
             "odometer": dict(zip(BIAS, self.odometer.tolist(), strict=True)),
@@ -109,6 +112,7 @@ def calibrate_drive(
     joint: bool = False,
     progress: Progress | None = None,
     more: tuple[str, ...] = (),
+    robot: bool = False,
 ) -> Calibration:
     """The rig fitted to a drive, and what it is worth.
 
@@ -118,7 +122,8 @@ def calibrate_drive(
     - `joint`: then solve all poses, lines, their heights and the mount together.
     - `progress`: called after each image that is searched.
     - `more`: what else to fit where the drive contradicts it as it was given, such as `IF_TOLD`.
-      With it the new camera file has the odometer's errors too.
+    - `robot`: whether the new camera file has the odometer's errors too, and how well each number
+      is known.
 
     **Raises:** `InputError` if the robot never moves; `ValueError` for what cannot be fitted.
     """
@@ -137,14 +142,14 @@ def calibrate_drive(
         if usable and joint:
             rig, covariance = _jointly(found, log, free)
         residuals = np.asarray(found.fit.residuals)[np.asarray(found.pairs.valid)]
-    file = _fitted_file(drive.camera_file, found, rig, covariance, bool(more))
+    file = _fitted_file(drive.camera_file, found, rig, covariance, robot)
     doubt = "; ".join([
         *filter(None, [doubts(found.fit, config.fit)]),
         *fitted_height(float(rig.mount.height), float(drive.camera_file.mount.height)),
     ])  # fmt: skip
     evidence = f"{len(residuals)} of {found.related} pairs of segments taken for floor"
     evidence += ", then jointly with poses and lines" * (usable and joint)
-    known = accuracy(covariance, found.free) + f"; {doubt}" * bool(doubt)
+    known = accuracy(covariance) + f"; {doubt}" * bool(doubt)
     verdict = FitVerdict.DOUBTFUL if doubt else FitVerdict(grade(covariance))
     odometer = np.asarray(found.fit.odometer)
     return Calibration(
@@ -197,22 +202,28 @@ def _fitted_file(
         by = np.asarray(rig.lens.coefficients - np.asarray(given.lens.coefficients), float)
         distortion = np.pad(distortion, (0, max(0, 2 - len(distortion))))
         distortion = distortion + np.pad(by[:2], (0, len(distortion) - 2))
+    for name in moved & {"time_offset", "line_delay"}:
+        clock = dataclasses.replace(clock, **{name: _short(getattr(rig, name))})
     if robot:
-        sigma = np.sqrt(np.diag(covariance))
-        known = {k: float(sigma[UNKNOWNS.index(k)]) for k in found.free}
-        clock = RigFields(
-            float(rig.time_offset), float(rig.line_delay), tuple(map(float, found.fit.odometer)),
-            {**clock.sigma, **known},
-        )  # fmt: skip
+        sigma = dict(zip(UNKNOWNS, map(_short, np.sqrt(np.diag(covariance))), strict=True))
+        known = {name: value for name, value in sigma.items() if value}
+        odometer = tuple(map(_short, found.fit.odometer))
+        clock = RigFields(clock.time_offset, clock.line_delay, odometer, {**clock.sigma, **known})
     return dataclasses.replace(file, camera=camera, mount=mount, distortion=distortion, clock=clock)
+
+
+def _short(value: SupportsFloat) -> float:
+    """A fitted number to the digits that it can have."""
+    return float(f"{float(value):.6g}")
 
 
 def _check_free(free: tuple[str, ...], joint: bool) -> None:
     for name in free:
         if name not in UNKNOWNS:
             raise ValueError(f"there is no {name!r} to fit; known are {', '.join(UNKNOWNS)}")
-    if not set(free) & set(MOUNT):
-        raise ValueError(f"one of {', '.join(MOUNT)} at least must be free")
+    some = MOUNT if joint else RIG
+    if not set(free) & set(some):
+        raise ValueError(f"one of {', '.join(some)} at least must be free")
     if joint and "distance" in free:
         raise ValueError("'joint' keeps the odometer's distances; 'distance' cannot be free")
 

@@ -10,6 +10,8 @@ FREE = (
     "height", "pitch", "roll", "yaw", "x", "y", "focal", "cx", "cy", "k1", "k2", "time_offset",
     "line_delay", "distance", "left", "right", "curvature",
 )  # fmt: skip
+OF_MOUNT = (*FREE[:4], *FREE[-4:])  # of these, what `calibrate mount` fits
+OF_RIG = FREE[:-4]  # and what is not the odometer's
 LOOPS = ("none", "paper", "smooth")  # after the drive: nothing, the paper's closing, smoothing
 
 
