@@ -26,7 +26,7 @@ RIG: tuple[str, ...] = (
     "height", "pitch", "roll", "yaw", "x", "y", "focal", "cx", "cy", "k1", "k2",
     "time_offset", "line_delay",
 )  # fmt: skip
-INTRINSICS = RIG[6:11]
+RIG_MOUNT, INTRINSICS = RIG[:6], RIG[6:11]
 ROUNDS = 3  # of Newton's method; a lens that is a little other is nearly linear
 
 

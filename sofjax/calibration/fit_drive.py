@@ -33,6 +33,7 @@ from sofjax.rig import Rig
 # where to begin: at the mount given, and far from it
 STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
 
+JOINED = 0.3  # of what counts as the same place: a start that comes so near another's end ends too
 STEPS = 12  # of a round's solver, at most: the next round goes on
 CONTRADICTED = 4.0  # standard deviations from which a number that was given is another
 
@@ -130,7 +131,9 @@ def fit_drive(given: Rig, log: Observation, config: DriveFitConfig | None = None
     """
     config = config or DriveFitConfig()
     log = without_unread_motions(log)
-    searched = [_search(start, log, config) for start in starts(given, config)]
+    searched: list[DriveFit] = []
+    for start in starts(given, config):
+        searched.append(_search(start, log, config, searched))
     ends = np.array([_place(found.fit.mount) for found in searched])
     alike = (_distance(ends[:, None], ends, config) < 1).all(-1)
     count = np.array([f.pairs.valid.sum() for f in searched])
@@ -251,11 +254,15 @@ def _distance(
     return np.abs(a - b) / [config.same_height * np.median(b[..., 0]), *[config.same_angle] * 2]
 
 
-def _search(start: Estimate, log: Observation, config: DriveFitConfig) -> DriveFit:
-    """The last of the rounds from one start, which hardly moves the mount."""
+def _search(
+    start: Estimate, log: Observation, config: DriveFitConfig, others: list["DriveFit"]
+) -> DriveFit:
+    """The last of the rounds from one start: it hardly moves the mount, or ends where another did."""
     found = _round(start, log, config, test_floor=False)
     for _ in range(config.search_rounds - 1):
         before = _place(found.fit.mount)
+        if any((_distance(before, _place(o.fit.mount), config) < JOINED).all() for o in others):
+            break
         found = _round(found.estimate, log, config, test_floor=False)
         if (_distance(before, _place(found.fit.mount), config) < config.settled).all():
             break

@@ -10,7 +10,7 @@ from sofjax.geometry.lines import cofactor, line_point_distance, line_through
 from sofjax.geometry.se2 import SE2
 from sofjax.geometry.two_view import two_view_homography
 from sofjax.motion import BIAS, MotionModel, read_twist, way_of
-from sofjax.rig import RIG, Rig, motion_between, retaken
+from sofjax.rig import RIG, RIG_MOUNT, Rig, motion_between, retaken
 
 UNKNOWNS = (*RIG, *BIAS)
 U = len(UNKNOWNS)
@@ -93,15 +93,17 @@ def seen_by(estimate: Estimate, pair: SegmentPairs) -> Seen:
 def seen_near(estimate: Estimate, pair: SegmentPairs) -> tuple[Seen, Float[Array, "11 17"]]:
     """One pair as seen, and how that changes with the estimate, by `Seen.moved`: to first order."""
     at = seen_by(estimate, pair)
+    lens_on = slice(len(RIG_MOUNT), len(RIG))  # of the mount nearly nothing depends here
 
-    def off(by: Float[Array, "17"]) -> Float[Array, "11"]:
-        other = seen_by(estimate.moved(by), pair)
+    def off(by: Float[Array, "7"]) -> Float[Array, "11"]:
+        other = seen_by(estimate.moved(jnp.zeros(U, by.dtype).at[lens_on].set(by)), pair)
         moved = at.T_first_second.between(other.T_first_second).log()
         return jnp.concatenate([
             (other.first - at.first).ravel(), (other.second - at.second).ravel(), moved,
         ])  # fmt: skip
 
-    return at, jax.jacfwd(off)(jnp.zeros(U, estimate.by.dtype))
+    J = jax.jacfwd(off)(jnp.zeros_like(estimate.by[lens_on]))
+    return at, jnp.zeros((11, U), J.dtype).at[:, lens_on].set(J)
 
 
 def distances(estimate: Estimate, seen: Seen) -> Float[Array, "4"]:

@@ -42,6 +42,7 @@ IF_TOLD = tuple(name for name in RIG if name not in (*BY_DEFAULT, "line_delay"))
 STANDS_STILL = 0.05  # metres and radians, below which a drive tells nothing of a rig
 FRONTEND = FrontendSettings(capacity=256)  # a fit is sure by many lines, of which a run needs few
 STEP = 32  # capacities are multiples of it
+COMPARED = 4e6  # pairs of segments of two images, of the whole drive: more make no fit surer
 
 
 @dataclass(frozen=True)
@@ -167,8 +168,9 @@ def calibrate_drive(
 
 
 def _narrowed(log: Observation) -> Observation:
-    """A log with no more room than its fullest image needs."""
-    most = int(np.asarray(log.segments_image.valid).sum(1).max())
+    """A log with no more room than its fullest image needs; the longer it is, the less."""
+    images, most = len(log.overflow), int(np.asarray(log.segments_image.valid).sum(1).max())
+    most = min(most, int((COMPARED / images) ** 0.5))
     room = max(STEP, -(-most // STEP) * STEP)
     segments = jax.tree.map(lambda a: a[:, :room], log.segments_image)
     return dataclasses.replace(log, segments_image=segments)
