@@ -27,14 +27,6 @@ CONFIG = DriveFitConfig(more=IF_TOLD, starts=((1.0, 0.0),), capacity=512)
 DEGREE = np.pi / 180
 
 
-@pytest.fixture(autouse=True)
-def quickly():
-    """Programs that run a few times: most of the time is the compiler's."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
 @cache
 def log_of(**by):
     with jax.enable_x64(True):
@@ -43,11 +35,11 @@ def log_of(**by):
 
 def fitted(**by):
     """A drive by a rig that is other than it was given, fitted from what was given."""
-    with jax.enable_x64(True):
-        return fit_drive(driven.given_rig(), log_of(**by), CONFIG)
+    return fit_drive(driven.given_rig(), log_of(**by), CONFIG)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     ("name", "by", "within"),
     [
@@ -74,7 +66,8 @@ def test_what_is_wrong_is_found_and_all_else_stays_as_it_was_given(name, by, wit
 
 
 @pytest.mark.slow
-def test_a_steady_straight_drive_does_not_tell_the_clock(capsys):
+@pytest.mark.usefixtures("x64")
+def test_a_steady_straight_drive_does_not_tell_the_clock():
     """Though the images are 80 ms late: it stays as it was given, and is named."""
     found = fitted(turns=False, time_offset=0.08)
     assert not np.asarray(found.estimate.by)[: len(RIG)].any()
@@ -144,7 +137,7 @@ class Recorded:
     """A simulated drive in the place of the images of a folder."""
 
     def __init__(self, monkeypatch, tmp_path):
-        self.folder = make_drive(tmp_path / "drive", 5)
+        self.folder = make_drive(tmp_path / "drive", 40)
         self.out = tmp_path / "found.yaml"
         self._patch = monkeypatch
         config = calibrate._config
@@ -174,8 +167,6 @@ class Recorded:
 
 @pytest.fixture
 def recorded(monkeypatch, tmp_path):
-    with jax.enable_x64(True):
-        driven.given_rig()
     return Recorded(monkeypatch, tmp_path)
 
 

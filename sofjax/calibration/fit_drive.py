@@ -27,7 +27,7 @@ from sofjax.calibration.tracks import TrackConfig, follow, relate
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.camera import Mount
 from sofjax.motion import BIAS, MotionModel, without_unread_motions
-from sofjax.rig import Rig
+from sofjax.rig import RIG, Rig
 
 # where to begin: at the mount given, and far from it
 STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
@@ -156,7 +156,6 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
         found = solved(found, found.estimate.by, {*asked, "distance"})
     all_free = np.asarray(found.fit.covariance)
     by, kept = contradicted(found.estimate.by, all_free, found.free)
-    as_given, not_told = _held(asked - kept - set(BIAS), all_free, config.fit.limit)
     kept |= set() if "height" in kept else {"distance"}
     by = np.where([name in kept for name in UNKNOWNS], by, 0.0)
     for _ in refine:
@@ -167,16 +166,12 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
     known = np.array(solved(found, by, free).fit.covariance)
     at = UNKNOWNS.index("distance")
     known[at, at] = found.fit.covariance[at, at]  # for a height that is right
+    told = np.diag(all_free) <= np.square(config.fit.limit)
+    told |= [name in config.fit.free for name in UNKNOWNS]  # the verdict says how well
+    held = {name: told[i] for i, name in enumerate(RIG) if name in asked - kept}
+    as_given = tuple(name for name, is_told in held.items() if is_told)
+    not_told = tuple(name for name, is_told in held.items() if not is_told)
     return replace(found, known=known, all_free=all_free, as_given=as_given, not_told=not_told)
-
-
-def _held(
-    names: set[str], all_free: Float[np.ndarray, "17 17"], limit: tuple[float, ...]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Those of what was held that the drive tells, and those that it does not."""
-    told = dict(zip(UNKNOWNS, np.sqrt(np.diag(all_free)) <= np.asarray(limit), strict=True))
-    held = [name for name in UNKNOWNS if name in names]
-    return tuple(n for n in held if told[n]), tuple(n for n in held if not told[n])
 
 
 def contradicted(
