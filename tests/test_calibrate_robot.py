@@ -81,6 +81,16 @@ def test_a_steady_straight_drive_does_not_tell_the_clock():
     assert np.abs(told.estimate.bias).max() < 0.005  # its odometer has no error
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("x64")
+def test_what_a_fit_of_a_few_numbers_does_not_need_is_set_back():
+    """By a wide covariance of many numbers one may seem contradicted: it is asked again."""
+    found = fitted(height=0.03)  # so much an odometer may err: the height holds
+    assert not np.asarray(found.estimate.by)[: len(RIG)].any()
+    assert float(found.estimate.bias[0]) == pytest.approx(np.exp(-0.03) - 1, abs=0.003)
+    assert "height" in found.as_given
+
+
 # What is contradicted
 
 

@@ -156,8 +156,13 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
         found = solved(found, found.estimate.by, {*asked, "distance"})
     all_free = np.asarray(found.fit.covariance)
     by, kept = contradicted(found.estimate.by, all_free, found.free)
+    before = None
+    while kept != before:  # a covariance of few numbers is surer than one of many: ask it again
+        before = kept
+        found = solved(found, _only(by, {*kept, "distance"}), {*kept, "distance"})
+        by, kept = contradicted(found.estimate.by, found.fit.covariance, found.free)
     kept |= set() if "height" in kept else {"distance"}
-    by = np.where([name in kept for name in UNKNOWNS], by, 0.0)
+    by = _only(by, kept)
     for _ in refine:
         found = solved(found, by, kept)
         by = found.estimate.by
@@ -172,6 +177,11 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
     as_given = tuple(name for name, is_told in held.items() if is_told)
     not_told = tuple(name for name, is_told in held.items() if not is_told)
     return replace(found, known=known, all_free=all_free, as_given=as_given, not_told=not_told)
+
+
+def _only(by: Float[ArrayLike, "17"], names: set[str]) -> Float[np.ndarray, "17"]:
+    """A change of some of the unknowns, and of none of the others."""
+    return np.where([name in {*names, *TURNS} for name in UNKNOWNS], np.asarray(by), 0.0)
 
 
 def contradicted(
