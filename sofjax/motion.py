@@ -38,10 +38,10 @@ class MotionModel(eqx.Module):
     distance_scale_sigma: float = 0.01  # prior of the relative error of distances
     turn_scale_sigma: float = 0.05  # prior of the relative errors of left and of right turns
     curvature_sigma: float = 0.005  # radians per metre, prior of the pull to one side
-    distance_error: float = 0.0  # prior means of the systematic errors b: shares, ...
-    left_error: float = 0.0
-    right_error: float = 0.0
-    curvature: float = 0.0  # ... and radians per metre; as a calibration knows them
+    distance_error: float = 0.0  # share, prior mean of what distances are to be changed by
+    left_error: float = 0.0  # share, prior mean of what left turns are to be changed by
+    right_error: float = 0.0  # the same of right turns
+    curvature: float = 0.0  # radians per metre, prior mean of the turn to the left to be added
     bias_drift: float = 0.02  # share of its prior that a systematic error wanders in sqrt(metre)
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip

@@ -28,7 +28,7 @@ from sofjax.calibration.tracks import TrackConfig, follow, relate
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.camera import Mount
 from sofjax.motion import BIAS, MotionModel, without_unread_motions
-from sofjax.rig import Rig
+from sofjax.rig import RIG, Rig
 
 # where to begin: at the mount given, and far from it
 STARTS = ((1.0, 0.0), (1.3, 0.14), (0.7, 0.14), (1.3, -0.14), (0.7, -0.14))
@@ -135,7 +135,7 @@ def fit_drive(given: Rig, log: Observation, config: DriveFitConfig | None = None
     for start in starts(given, config):
         searched.append(_search(start, log, config, searched))
     ends = np.array([_place(found.fit.mount) for found in searched])
-    alike = (_distance(ends[:, None], ends, config) < 1).all(-1)
+    alike = np.all(_distance(ends[:, None], ends, config) < 1, axis=-1)
     count = np.array([f.pairs.valid.sum() for f in searched])
     best = int(np.lexsort((-count, -alike.sum(1)))[0])
     found = searched[best]
@@ -143,7 +143,7 @@ def fit_drive(given: Rig, log: Observation, config: DriveFitConfig | None = None
         found = _round(found.estimate, log, config, test_floor=True)
     if config.more:
         found = _freed(found, log, config)
-    return replace(found, ends=ends, same=ends[alike[best]])
+    return replace(found, ends=ends, same=ends[np.flatnonzero(alike[best])])
 
 
 def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFit:
@@ -166,24 +166,33 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
             break
         kept.add(name)
         found = solved(found, found.estimate.by, mount | kept)
-    found = solved(found, found.estimate.by, mount | kept | {"distance"})
-    by, kept = contradicted(found.estimate.by, found.fit.covariance, found.free)
+    by, before, kept = found.estimate.by, set(), mount | kept
+    while kept != before:
+        before = kept
+        found = solved(found, _only(by, {*kept, "distance"}), {*kept, "distance"})
+        by, kept = contradicted(found.estimate.by, found.fit.covariance, found.free)
     kept |= set() if "height" in kept else {"distance"}
-    by = np.where([name in kept for name in UNKNOWNS], by, 0.0)
+    by = _only(by, kept)
     for _ in range(config.refine_rounds):
         found = solved(found, by, kept)
         by = found.estimate.by
     # how well it is known, were it not given: apart from the scale, which no image tells
-    known = np.asarray(solved(found, by, (mount | kept) - {"distance"}).fit.covariance)
+    known = np.array(solved(found, by, (mount | kept) - {"distance"}).fit.covariance)
+    at = UNKNOWNS.index("distance")
+    known[at, at] = found.fit.covariance[at, at]  # for a height that is right
     limit = dict(zip(UNKNOWNS, config.fit.limit, strict=True))
-    sigma = dict(zip(UNKNOWNS, np.sqrt(np.diag(known)).tolist(), strict=True))
-    sigma |= {name: one.sigma for name, one in tried.items()}
-    held = [name for name in UNKNOWNS if name in (mount | more) - kept - {*TURNS}]
+    told = {name for name in tried if tried[name].sigma <= limit[name]} | mount
+    held = [name for name in RIG if name in (mount | more) - kept]
     return replace(
         found, known=known,
-        as_given=tuple(name for name in held if sigma[name] <= limit[name]),
-        not_told=tuple(name for name in held if sigma[name] > limit[name]),
+        as_given=tuple(name for name in held if name in told),  # of the mount the verdict says how
+        not_told=tuple(name for name in held if name not in told),
     )  # fmt: skip
+
+
+def _only(by: Float[ArrayLike, "17"], names: set[str]) -> Float[np.ndarray, "17"]:
+    """A change of some of the unknowns, and of none of the others."""
+    return np.where([name in {*names, *TURNS} for name in UNKNOWNS], np.asarray(by), 0.0)
 
 
 class Tried(NamedTuple):
@@ -193,16 +202,13 @@ class Tried(NamedTuple):
     contradicted: float  # standard deviations by which it is another than it was given
 
 
-def _freed_one_by_one(
-    found: DriveFit, config: DriveFitConfig, names: set[str]
-) -> dict[str, Tried]:
+def _freed_one_by_one(found: DriveFit, config: DriveFitConfig, names: set[str]) -> dict[str, Tried]:
     """Each of the numbers freed beside those of a fit, with its associations."""
     tried = {}
     for name in sorted(names):
         i = UNKNOWNS.index(name)
-        fit = fit_rig(
-            found.estimate, found.pairs, replace(config.fit, free=(*found.free, name)), STEPS
-        )
+        free = replace(config.fit, free=(*found.free, name))
+        fit = fit_rig(found.estimate, found.pairs, free, STEPS)
         sigma = max(float(fit.covariance[i, i]) ** 0.5, 1e-12)
         tried[name] = Tried(sigma, abs(float(fit.estimate.by[i])) / sigma)
     return tried

@@ -92,7 +92,7 @@ def _held(found: "Calibration") -> list[str]:
     if fit.as_given:
         lines.append(f"  as given  {', '.join(fit.as_given)} (nothing contradicts them)")
     if fit.not_told:
-        lines.append(f"  not told  {', '.join(fit.not_told)}, as given (not told by this drive)")
+        lines.append(f"  not told  {', '.join(fit.not_told)} (by this drive; they stay as given)")
     return lines
 
 

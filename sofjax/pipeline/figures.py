@@ -101,7 +101,7 @@ def draw_calibration(path: Path, found: "Calibration") -> bool:
         return False
     old, new = _residuals(found)
     floors, extent = _floors(found)
-    title = f"{found.drive.name}: {found.sentence}"
+    title = f"{found.drive.name}: {found.verdict}: {found.sentence}"
     viewer.draw_mount(path, title, old[valid], new[valid], floors, extent)
     return True
 

@@ -44,7 +44,8 @@ def local_map(
     config, sensor = setup.config.segment_map, setup.config.sensor
     T_world_nadir = T_world_robot @ setup.mount.T_robot_nadir
     ends = jnp.where(measurements.valid[:, None, None], measurements.endpoints_nadir, 0)
-    radius = jnp.sqrt(jnp.sum(ends**2, axis=-1).max()) + config.join_gap + MARGIN * setup.mount.height
+    margin = config.join_gap + MARGIN * setup.mount.height
+    radius = jnp.sqrt(jnp.sum(ends**2, axis=-1).max()) + margin
     near, truncated = nearby(config, segment_map, T_world_nadir, radius)
     lines = segment_map.take(near)
     candidates, at, nearest = candidate_associations(
