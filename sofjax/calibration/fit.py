@@ -30,7 +30,8 @@ from sofjax.smoothing.problem import robust
 # the odometer's errors, and those from which on an answer is none
 PRIOR = dict(
     height=3.0, pitch=1.0, roll=1.0, yaw=0.1, x=0.5, y=0.5, focal=0.05, cx=0.02, cy=0.02, k1=0.05,
-    k2=0.05, time_offset=0.2, line_delay=5e-5, distance=0.01, left=0.05, right=0.05, curvature=0.005,
+    k2=0.05, time_offset=0.2, line_delay=5e-5, distance=0.01, left=0.05, right=0.05,
+    curvature=0.005,
 )  # fmt: skip
 LIMIT = dict(
     height=0.05, pitch=0.0088, roll=0.0088, yaw=0.0088, x=0.1, y=0.1, focal=0.01, cx=0.01, cy=0.01,

@@ -263,7 +263,7 @@ def _distance(
 def _search(
     start: Estimate, log: Observation, config: DriveFitConfig, others: list["DriveFit"]
 ) -> DriveFit:
-    """The last of the rounds from one start: it hardly moves the mount, or ends where another did."""
+    """The last of the rounds from one start: it moves no more, or comes to where another ended."""
     found = _round(start, log, config, test_floor=False)
     for _ in range(config.search_rounds - 1):
         before = _place(found.fit.mount)

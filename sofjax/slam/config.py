@@ -105,10 +105,10 @@ class Setup(eqx.Module):
     mount: Mount
 
     def __init__(self, config: SlamConfig, camera: Camera, mount: Mount) -> None:
-        arguments: tuple[tuple[str, object, type], ...] = (
-            ("config", config, SlamConfig), ("camera", camera, Camera), ("mount", mount, Mount),
-        )  # fmt: skip
-        for name, given, kind in arguments:
+        arguments: dict[str, tuple[object, type]] = {
+            "config": (config, SlamConfig), "camera": (camera, Camera), "mount": (mount, Mount),
+        }  # fmt: skip
+        for name, (given, kind) in arguments.items():
             if not isinstance(given, kind):
                 raise ValueError(
                     f"{type(self).__name__}(config, camera, mount): {name} must be a "
