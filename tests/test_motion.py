@@ -32,7 +32,7 @@ def draws(model, odometer, mean=None):
     """Twists (forward, sideways, turn) of N particles, and what each has learned."""
     bias = prior_bias(model)
     means = jnp.broadcast_to(bias.mean if mean is None else jnp.array(mean, float), (N, 4))
-    motion, learned = sample(
+    motion, learned, _ = sample(
         model,
         OdometerBias(means, bias.covariance),
         odometer,

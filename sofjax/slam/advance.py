@@ -5,11 +5,13 @@ from jaxtyping import PRNGKeyArray
 
 from sofjax.extraction.sof import View, keep_views
 from sofjax.likelihood.tracking import adapt_inflation
-from sofjax.particles import effective_size, pose_covariance
+from sofjax.motion import adapt_odometer
+from sofjax.particles import effective_size, mean_bias, pose_covariance
 from sofjax.slam.choose import Chosen
 from sofjax.slam.config import Setup
 from sofjax.slam.extract import Extracted
 from sofjax.slam.map_update import Updated
+from sofjax.slam.predict import Predicted
 from sofjax.slam.reweight import LocalMap, Weighted
 from sofjax.slam.state import SlamState, StepInfo
 
@@ -20,6 +22,7 @@ ACROSS = 0.5  # sine of the angle to the heading from which a line is transverse
 def advance(
     setup: Setup,
     state: SlamState,
+    predicted: Predicted,
     extracted: Extracted,
     local: LocalMap,
     weighted: Weighted,
@@ -40,17 +43,23 @@ def advance(
         adapt_inflation(config.sensor, state.variance_inflation, misfit),
         state.variance_inflation,
     )
+    odometer_inflation = adapt_odometer(
+        config.motion, state.odometer_inflation, jnp.exp(predicted.particles.log_weight),
+        jnp.exp(weighted.particles.log_weight), predicted.draws,
+    )  # fmt: skip
     unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
     detected = extracted.segments_image.valid
     on_floor = measurements.valid & (known | updated.new)
     info = StepInfo(
         T_world_robot=chosen.T_world_robot,
         covariance=pose_covariance(chosen.weighted),
-        bias=jnp.exp(chosen.weighted.log_weight) @ chosen.weighted.bias.mean,
+        bias=mean_bias(chosen.weighted),
         effective_size=effective_size(weighted.particles.log_weight),
         log_evidence=weighted.log_evidence,
         jitter=chosen.score.jitter,
         misfit=misfit,
+        sensor_inflation=inflation,
+        odometer_inflation=odometer_inflation,
         detected=detected.sum(),
         below_horizon=measurements.valid.sum(),
         associated=extracted.is_sof.sum(),
@@ -64,7 +73,7 @@ def advance(
         segment_class=detected.astype(int) + measurements.valid.astype(int) + on_floor.astype(int),
     )
     after = SlamState(
-        chosen.particles, updated.segment_map, recent, reference, inflation, unmatched, key,
-        state.window,
+        chosen.particles, updated.segment_map, recent, reference, inflation,
+        odometer_inflation, unmatched, key, state.window,
     )  # fmt: skip
     return after, info

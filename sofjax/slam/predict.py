@@ -7,8 +7,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sofjax._pytree import in_any_run
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.se2 import SE2
-from sofjax.motion import read_or_unknown, sample_motion, sample_slip, sample_unknown
-from sofjax.particles import Particles, mean_pose
+from sofjax.motion import (
+    read_or_unknown,
+    read_twist,
+    sample_motion,
+    sample_slip,
+    sample_unknown,
+    way_of,
+)
+from sofjax.particles import Particles, mean_bias, mean_pose
 from sofjax.slam.config import Setup
 from sofjax.slam.state import SlamState
 
@@ -21,6 +28,7 @@ class Predicted(eqx.Module):
     particles: Particles  # weighted by the prior
     unslipped: Particles  # the same before the slips that some of them try
     log_slip_ratio: Float[Array, "N"]  # log importance weight of those slips
+    draws: Float[Array, "N 2"]  # of the noise in distance and turn, standard deviations
     T_world_robot: SE2  # their mean
     odometer: SE2  # T_previous_current as read
     unread_sigma: Float[Array, "3"]  # standard deviation of what was not read; metres, radians
@@ -33,11 +41,19 @@ def predict(
     key_motion: PRNGKeyArray,
     key_slip: PRNGKeyArray,
 ) -> Predicted:
-    """The particles of the last step, each moved by a draw of the motion model."""
+    """The particles of the last step, each moved by a draw of the motion model.
+
+    Their mean moves by the reading, corrected by the mean of what was learned of its errors: the
+    mean of a cloud that a noise in heading has bent is shorter than any path in it, and where
+    nothing is seen the estimate is the odometer's path. The paper's single winner has no mean.
+    """
     motion_model, N = setup.config.motion, setup.config.filter.particles
     odometer, unread = read_or_unknown(observation.motion, observation.motion_sigma)
-    motion, bias = sample_motion(motion_model, state.particles.bias, odometer, key_motion)
+    motion, bias, draws = sample_motion(
+        motion_model, state.particles.bias, odometer, key_motion, state.odometer_inflation
+    )
     testable = state.variance_inflation < SLIP_INFLATION
+    testable = testable & observation.segments_image.valid.any()  # in the dark nothing is tested
     slip, log_ratio = sample_slip(motion_model, odometer, testable, key_slip, N)
     start = state.particles.T_world_robot
     start = jax.lax.cond(
@@ -46,7 +62,12 @@ def predict(
         lambda: start,
     )
     unslipped = Particles(start @ motion, bias, state.particles.log_weight)
+    if setup.config.filter.choice == "resample":
+        b = mean_bias(state.particles)
+        read = SE2.exp(read_twist(odometer, way_of(odometer), b))
+        unslipped = unslipped.moved_to(mean_pose(state.particles) @ read, b)
     prior = state.particles.log_weight + log_ratio
     T_world_robot = unslipped.T_world_robot @ slip
-    particles = Particles(T_world_robot, bias, prior - jax.nn.logsumexp(prior))
-    return Predicted(particles, unslipped, log_ratio, mean_pose(particles), odometer, unread)
+    particles = Particles(T_world_robot, unslipped.bias, prior - jax.nn.logsumexp(prior))
+    T_mean = mean_pose(particles)
+    return Predicted(particles, unslipped, log_ratio, draws, T_mean, odometer, unread)

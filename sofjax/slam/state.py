@@ -24,6 +24,7 @@ class SlamState(eqx.Module):
     recent: View  # the last two views kept, a baseline apart
     reference: View
     variance_inflation: Float[Array, ""]  # of the measurements, against the sensor model; >= 1
+    odometer_inflation: Float[Array, "2"]  # of the variance of distances and of turns; >= 1
     unmatched: Int[Array, ""]  # images in a row without one known segment
     key: PRNGKeyArray
     window: Window | None  # with a fixed lag
@@ -39,6 +40,8 @@ class StepInfo(eqx.Module):
     log_evidence: Float[Array, "*batch"]  # log of the mean likelihood of the particles, weighted
     jitter: Float[Array, "*batch 2"]  # attitude jitter (pitch, roll) of the image, radians
     misfit: Float[Array, "*batch"]  # mean error e of the matched segments; 2 if sigmas are true
+    sensor_inflation: Float[Array, "*batch"]  # of the pixels' variance after the image; >= 1
+    odometer_inflation: Float[Array, "*batch 2"]  # of that of distances and of turns; >= 1
     detected: Int[Array, "*batch"]
     below_horizon: Int[Array, "*batch"]  # on the floor's side of the horizon and within range
     associated: Int[Array, "*batch"]  # of them, by eq. (9)
@@ -78,8 +81,8 @@ def initial_state(setup: Setup, key: PRNGKeyArray, capacity: int) -> SlamState:
         )
         window = empty_window(config.window, config.segment_map.capacity, nothing)
     return SlamState(
-        particles, empty_map(config.segment_map), none, none, jnp.ones(()), jnp.zeros((), int),
-        key, window,
+        particles, empty_map(config.segment_map), none, none, jnp.ones(()), jnp.ones(2),
+        jnp.zeros((), int), key, window,
     )  # fmt: skip
 
 

@@ -31,7 +31,9 @@ def one_round(
     # 6) integrate the observed segments into the map, as seen from the chosen pose
     updated = update_map(setup, state.segment_map, extracted, local, chosen)
     # 7) the next round starts from here
-    after, info = advance(setup, state, extracted, local, weighted, chosen, updated, key)
+    after, info = advance(
+        setup, state, predicted, extracted, local, weighted, chosen, updated, key
+    )
     return after, info, Mapped(extracted.measurements, updated.new_slots)
 
 
