@@ -15,6 +15,8 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
 
 UNREAD = (0.3, 0.3, 0.3)  # metres and radians, standard deviation of a motion that is not a number
+MOST = 2.0  # surplus that one image can tell: faster, and the sensor would be believed first
+FADING = 0.9  # power of the inflation in a step without a witness
 BIAS = ("distance", "left", "right", "curvature")  # names of the systematic errors b
 
 
@@ -162,6 +164,7 @@ def adapt_odometer(
     prior: Float[Array, "N"],
     posterior: Float[Array, "N"],
     draws: Float[Array, "N 2"],
+    sound: Bool[Array, ""],
 ) -> Float[Array, "2"]:
     """The inflation of the odometer's variance (distance, turn) after an image; at least 1.
 
@@ -172,9 +175,12 @@ def adapt_odometer(
     **Arguments:**
     - `prior`, `posterior`: weights before and after the image.
     - `draws`: z, of `sample_motion`.
+    - `sound`: whether the images agree with the map. If not they are no witness of the odometer,
+      and the inflation fades.
     """
-    surplus = (posterior - prior) @ draws**2
-    return jnp.clip(inflation * jnp.exp(model.adaptation * surplus), 1, model.noise_max)
+    surplus = jnp.minimum((posterior - prior) @ draws**2, MOST)
+    grown = jnp.where(sound, jnp.exp(model.adaptation * surplus) * inflation, inflation**FADING)
+    return jnp.clip(grown, 1, model.noise_max)
 
 
 def read_or_unknown(

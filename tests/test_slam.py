@@ -217,7 +217,8 @@ def test_an_image_is_compared_with_the_last_view_a_baseline_away(used):
     state, info = stepped(map(frame, range(12)))
 
     def view(i, segments):
-        return View(segments, SE2(info.T_world_robot.xy[i], info.T_world_robot.yaw[i]))
+        T = SE2(info.T_world_robot.xy[i], info.T_world_robot.yaw[i])
+        return View(segments, T, T)
 
     nothing = black(SE2.identity()).segments_image
     views = {

@@ -13,7 +13,7 @@ from sofjax.slam.extract import Extracted
 from sofjax.slam.map_update import Updated
 from sofjax.slam.predict import Predicted
 from sofjax.slam.reweight import LocalMap, Weighted
-from sofjax.slam.state import SlamState, StepInfo
+from sofjax.slam.state import Consistency, SlamState, StepInfo
 
 LOST_AFTER = 10  # images without one known segment
 ACROSS = 0.5  # sine of the angle to the heading from which a line is transverse
@@ -22,6 +22,7 @@ ACROSS = 0.5  # sine of the angle to the heading from which a line is transverse
 def advance(
     setup: Setup,
     state: SlamState,
+    agreed: Consistency,
     predicted: Predicted,
     extracted: Extracted,
     local: LocalMap,
@@ -35,7 +36,7 @@ def advance(
     known, error = updated.known, chosen.score.error
     recent, reference = keep_views(
         config.association, state.recent, state.reference,
-        View(extracted.segments_image, chosen.T_world_robot),
+        View(extracted.segments_image, chosen.T_world_robot, agreed.T_odometer),
     )  # fmt: skip
     misfit = jnp.where(known, error, 0).sum() / jnp.maximum(known.sum(), 1).astype(float)
     inflation = jnp.where(
@@ -43,10 +44,12 @@ def advance(
         adapt_inflation(config.sensor, state.variance_inflation, misfit),
         state.variance_inflation,
     )
-    odometer_inflation = adapt_odometer(
-        config.motion, state.odometer_inflation, jnp.exp(predicted.particles.log_weight),
-        jnp.exp(weighted.particles.log_weight), predicted.draws,
-    )  # fmt: skip
+    odometer_inflation = state.odometer_inflation
+    if not config.filter.soft:  # whose evidence is of the noise as it is set
+        odometer_inflation = adapt_odometer(
+            config.motion, odometer_inflation, jnp.exp(predicted.particles.log_weight),
+            jnp.exp(weighted.particles.log_weight), predicted.draws, predicted.sensor_is_sound,
+        )  # fmt: skip
     unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
     detected = extracted.segments_image.valid
     on_floor = measurements.valid & (known | updated.new)
@@ -60,8 +63,9 @@ def advance(
         misfit=misfit,
         sensor_inflation=inflation,
         odometer_inflation=odometer_inflation,
+        trusted=agreed.trusted,
         detected=detected.sum(),
-        below_horizon=measurements.valid.sum(),
+        below_horizon=extracted.seen.sum(),
         associated=extracted.is_sof.sum(),
         reobserved=(extracted.is_sof & known).sum(),
         matched=known.sum(),
@@ -70,10 +74,10 @@ def advance(
         map_overflow=updated.overflow,
         map_truncated=local.truncated,
         lost=unmatched >= LOST_AFTER,
-        segment_class=detected.astype(int) + measurements.valid.astype(int) + on_floor.astype(int),
+        segment_class=detected.astype(int) + extracted.seen.astype(int) + on_floor.astype(int),
     )
     after = SlamState(
         chosen.particles, updated.segment_map, recent, reference, inflation,
-        odometer_inflation, unmatched, key, state.window,
+        odometer_inflation, agreed, unmatched, key, state.window,
     )  # fmt: skip
     return after, info

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sofjax._pytree import in_any_run
 from sofjax.extraction.observation import Observation
@@ -19,7 +19,7 @@ from sofjax.particles import Particles, mean_bias, mean_pose
 from sofjax.slam.config import Setup
 from sofjax.slam.state import SlamState
 
-SLIP_INFLATION = 1.5  # variance inflation up to which a slip of the wheels is tested
+SLIP_INFLATION = 1.5  # variance inflation up to which the images are witnesses of the wheels
 
 
 class Predicted(eqx.Module):
@@ -29,6 +29,7 @@ class Predicted(eqx.Module):
     unslipped: Particles  # the same before the slips that some of them try
     log_slip_ratio: Float[Array, "N"]  # log importance weight of those slips
     draws: Float[Array, "N 2"]  # of the noise in distance and turn, standard deviations
+    sensor_is_sound: Bool[Array, ""]  # the last images agreed with the map and the odometer
     T_world_robot: SE2  # their mean
     odometer: SE2  # T_previous_current as read
     unread_sigma: Float[Array, "3"]  # standard deviation of what was not read; metres, radians
@@ -52,8 +53,10 @@ def predict(
     motion, bias, draws = sample_motion(
         motion_model, state.particles.bias, odometer, key_motion, state.odometer_inflation
     )
-    testable = state.variance_inflation < SLIP_INFLATION
-    testable = testable & observation.segments_image.valid.any()  # in the dark nothing is tested
+    sound = state.variance_inflation < SLIP_INFLATION
+    if setup.config.filter.doubting:
+        sound = sound & state.consistency.trusted
+    testable = sound & observation.segments_image.valid.any()
     slip, log_ratio = sample_slip(motion_model, odometer, testable, key_slip, N)
     start = state.particles.T_world_robot
     start = jax.lax.cond(
@@ -70,4 +73,4 @@ def predict(
     T_world_robot = unslipped.T_world_robot @ slip
     particles = Particles(T_world_robot, unslipped.bias, prior - jax.nn.logsumexp(prior))
     T_mean = mean_pose(particles)
-    return Predicted(particles, unslipped, log_ratio, draws, T_mean, odometer, unread)
+    return Predicted(particles, unslipped, log_ratio, draws, sound, T_mean, odometer, unread)

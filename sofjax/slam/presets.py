@@ -31,7 +31,7 @@ PAPER = SlamConfig(
         merge_distance=0.05,
         min_share=0.0,
     ),
-    filter=FilterConfig(choice="winner", gate_each=True),
+    filter=FilterConfig(choice="winner", gate_each=True, doubts=False),
 )
 
 PRESETS = {"default": DEFAULT, "paper": PAPER}

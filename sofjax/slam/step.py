@@ -7,6 +7,7 @@ from sofjax.extraction.observation import Observation
 from sofjax.slam.advance import advance
 from sofjax.slam.choose import choose
 from sofjax.slam.config import Setup
+from sofjax.slam.consistency import consistency, without_doubtful
 from sofjax.slam.extract import extract_sof
 from sofjax.slam.fixed_lag import Mapped, with_fixed_lag
 from sofjax.slam.map_update import update_map
@@ -24,6 +25,10 @@ def one_round(
     predicted = predict(setup, state, observation, key_motion, key_slip)
     # 4) put the segments on the floor, and extract SoF (Fig. 5) against a view a baseline away
     extracted = extract_sof(setup, state, observation, predicted)
+    agreed = state.consistency
+    if setup.config.filter.doubting:
+        agreed = consistency(setup, state, predicted, extracted)
+        predicted, extracted = without_doubtful(state.consistency, agreed, predicted, extracted)
     # 5) compare with the map by the sensor model, and choose
     local = local_map(setup, state.segment_map, extracted.measurements, predicted.T_world_robot)
     weighted = reweight(setup, predicted, extracted, local)
@@ -32,7 +37,7 @@ def one_round(
     updated = update_map(setup, state.segment_map, extracted, local, chosen)
     # 7) the next round starts from here
     after, info = advance(
-        setup, state, predicted, extracted, local, weighted, chosen, updated, key
+        setup, state, agreed, predicted, extracted, local, weighted, chosen, updated, key
     )
     return after, info, Mapped(extracted.measurements, updated.new_slots)
 
