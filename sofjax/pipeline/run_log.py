@@ -100,7 +100,7 @@ class RunLog:
 
     @property
     def noise(self) -> dict[str, object]:
-        """The most by which the variances of sensor and odometer were inflated, against the model."""
+        """The largest inflation of the variances of sensor and odometer, against the model."""
         distance, turn = np.max(self.odometer_inflation, axis=0, initial=1.0).tolist()
         return {
             "sensor_inflation": max(self.sensor_inflation, default=1.0),

@@ -5,15 +5,13 @@ from jaxtyping import PRNGKeyArray
 
 from sofjax.extraction.sof import View, keep_views
 from sofjax.likelihood.tracking import adapt_inflation
-from sofjax.motion import adapt_odometer
 from sofjax.particles import effective_size, mean_bias, pose_covariance
 from sofjax.slam.choose import Chosen
 from sofjax.slam.config import Setup
 from sofjax.slam.extract import Extracted
 from sofjax.slam.map_update import Updated
-from sofjax.slam.predict import Predicted
 from sofjax.slam.reweight import LocalMap, Weighted
-from sofjax.slam.state import Consistency, SlamState, StepInfo
+from sofjax.slam.state import SlamState, StepInfo
 
 LOST_AFTER = 10  # images without one known segment
 ACROSS = 0.5  # sine of the angle to the heading from which a line is transverse
@@ -22,8 +20,6 @@ ACROSS = 0.5  # sine of the angle to the heading from which a line is transverse
 def advance(
     setup: Setup,
     state: SlamState,
-    agreed: Consistency,
-    predicted: Predicted,
     extracted: Extracted,
     local: LocalMap,
     weighted: Weighted,
@@ -36,7 +32,7 @@ def advance(
     known, error = updated.known, chosen.score.error
     recent, reference = keep_views(
         config.association, state.recent, state.reference,
-        View(extracted.segments_image, chosen.T_world_robot, agreed.T_odometer),
+        View(extracted.segments_image, chosen.T_world_robot, extracted.consistency.T_odometer),
     )  # fmt: skip
     misfit = jnp.where(known, error, 0).sum() / jnp.maximum(known.sum(), 1).astype(float)
     inflation = jnp.where(
@@ -44,12 +40,6 @@ def advance(
         adapt_inflation(config.sensor, state.variance_inflation, misfit),
         state.variance_inflation,
     )
-    odometer_inflation = state.odometer_inflation
-    if not config.filter.soft:  # whose evidence is of the noise as it is set
-        odometer_inflation = adapt_odometer(
-            config.motion, odometer_inflation, jnp.exp(predicted.particles.log_weight),
-            jnp.exp(weighted.particles.log_weight), predicted.draws, predicted.sensor_is_sound,
-        )  # fmt: skip
     unmatched = jnp.where(known.any(), 0, state.unmatched + 1)
     detected = extracted.segments_image.valid
     on_floor = measurements.valid & (known | updated.new)
@@ -62,8 +52,8 @@ def advance(
         jitter=chosen.score.jitter,
         misfit=misfit,
         sensor_inflation=inflation,
-        odometer_inflation=odometer_inflation,
-        trusted=agreed.trusted,
+        odometer_inflation=weighted.odometer_inflation,
+        trusted=extracted.consistency.trusted,
         detected=detected.sum(),
         below_horizon=extracted.seen.sum(),
         associated=extracted.is_sof.sum(),
@@ -78,6 +68,6 @@ def advance(
     )
     after = SlamState(
         chosen.particles, updated.segment_map, recent, reference, inflation,
-        odometer_inflation, agreed, unmatched, key, state.window,
+        weighted.odometer_inflation, extracted.consistency, unmatched, key, state.window,
     )  # fmt: skip
     return after, info

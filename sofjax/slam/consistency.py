@@ -36,11 +36,9 @@ def consistency(
     before = state.consistency
     T_odometer = before.T_odometer @ predicted.odometer
     motion = extracted.view.T_odometer.between(T_odometer)
-    counts = jnp.where(
-        extracted.view.segments_image.valid.any(),
-        KEPT * before.counts + _counts(setup, extracted, motion),
-        before.counts,
-    )
+    compared = extracted.view.segments_image.valid.any() & (predicted.unread_sigma == 0).all()
+    image = _counts(setup, extracted, motion)
+    counts = jnp.where(compared, KEPT * before.counts + image, before.counts)
     seen, as_read, by_chance, still = counts
     told = as_read - by_chance > SURE * jnp.sqrt(as_read + by_chance)
     contradiction = (still - as_read) / jnp.maximum(seen, 1)
@@ -72,13 +70,15 @@ def _counts(setup: Setup, extracted: Extracted, motion: SE2) -> Float[Array, "4"
     return jnp.stack(counts).astype(float)
 
 
-def without_doubtful(
-    before: Consistency, after: Consistency, predicted: Predicted, extracted: Extracted
+def doubt(
+    setup: Setup, state: SlamState, predicted: Predicted, extracted: Extracted
 ) -> tuple[Predicted, Extracted]:
     """No segment is used of an image that is not trusted; what is given up is taken back."""
+    before, after = state.consistency, consistency(setup, state, predicted, extracted)
     extracted = eqx.tree_at(
-        lambda e: e.measurements.valid, extracted, extracted.measurements.valid & after.trusted
-    )
+        lambda e: (e.measurements.valid, e.consistency), extracted,
+        (extracted.measurements.valid & after.trusted, after),
+    )  # fmt: skip
     given_up = before.trusted & ~after.trusted
     particles, unslipped = (
         jax.tree.map(
@@ -92,3 +92,20 @@ def without_doubtful(
         (particles, unslipped, mean_pose(particles)),
     )  # fmt: skip
     return predicted, extracted
+
+
+def through_unread(
+    state: SlamState, predicted: Predicted, extracted: Extracted, T_world_robot: SE2
+) -> Extracted:
+    """Where the odometer told nothing, its path goes on by the estimate's motion."""
+    before, after = state.consistency, extracted.consistency
+    motion = mean_pose(state.particles).between(T_world_robot)
+    unread = (predicted.unread_sigma > 0).any()
+    paths = jax.tree.map(
+        lambda by_estimate, as_read: jnp.where(unread, by_estimate, as_read),
+        (before.T_odometer @ motion, before.T_world_robot @ motion),
+        (after.T_odometer, after.T_world_robot),
+    )
+    return eqx.tree_at(
+        lambda e: (e.consistency.T_odometer, e.consistency.T_world_robot), extracted, paths
+    )

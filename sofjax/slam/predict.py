@@ -28,6 +28,7 @@ class Predicted(eqx.Module):
     particles: Particles  # weighted by the prior
     unslipped: Particles  # the same before the slips that some of them try
     log_slip_ratio: Float[Array, "N"]  # log importance weight of those slips
+    odometer_inflation: Float[Array, "2"]  # of the variance that was drawn
     draws: Float[Array, "N 2"]  # of the noise in distance and turn, standard deviations
     sensor_is_sound: Bool[Array, ""]  # the last images agreed with the map and the odometer
     T_world_robot: SE2  # their mean
@@ -73,4 +74,7 @@ def predict(
     T_world_robot = unslipped.T_world_robot @ slip
     particles = Particles(T_world_robot, unslipped.bias, prior - jax.nn.logsumexp(prior))
     T_mean = mean_pose(particles)
-    return Predicted(particles, unslipped, log_ratio, draws, sound, T_mean, odometer, unread)
+    return Predicted(
+        particles, unslipped, log_ratio, state.odometer_inflation, draws, sound, T_mean, odometer,
+        unread,
+    )  # fmt: skip

@@ -15,7 +15,6 @@ from sofjax.segment_map import SegmentMap, empty_map
 from sofjax.slam.config import Setup
 from sofjax.slam.keyframes import Window, empty_window
 
-
 FIRST_WAIT = 50.0  # images that must agree before they are used again; then twice as many
 
 
