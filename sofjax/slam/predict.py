@@ -69,7 +69,8 @@ def predict(
     if setup.config.filter.choice == "resample":
         b = mean_bias(state.particles)
         read = SE2.exp(read_twist(odometer, way_of(odometer), b))
-        unslipped = unslipped.moved_to(mean_pose(state.particles) @ read, b)
+        begun = Particles(start, state.particles.bias, state.particles.log_weight)
+        unslipped = unslipped.moved_to(mean_pose(begun) @ read, b)
     prior = state.particles.log_weight + log_ratio
     T_world_robot = unslipped.T_world_robot @ slip
     particles = Particles(T_world_robot, unslipped.bias, prior - jax.nn.logsumexp(prior))
