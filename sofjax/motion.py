@@ -15,12 +15,10 @@ from sofjax.geometry.angles import safe_sqrt
 from sofjax.geometry.se2 import SE2
 
 UNREAD = (0.3, 0.3, 0.3)  # metres and radians, standard deviation of a motion that is not a number
-BIAS: tuple[str, ...] = (
-    "distance",
-    "left",
-    "right",
-    "curvature",
-)  # names of the systematic errors b
+MOST = 2.0  # surplus that one image can tell: faster, and the sensor would be believed first
+FADING = 0.9  # power of the inflation in a step without a witness
+# names of the systematic errors b, and of the settings that are their prior means
+BIAS: tuple[str, ...] = ("distance", "left", "right", "curvature")
 MEANS = ("distance_error", "left_error", "right_error", "curvature")
 
 
@@ -46,10 +44,12 @@ class MotionModel(eqx.Module):
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip
     slip_turn: float = 0.05  # radians, standard deviation of a slip
+    adaptation: float = 0.3  # share of the surplus by which the variance inflates in a step
+    noise_max: float = 1e4  # variance inflation up to which the odometer may be worse than all this
 
     def __check_init__(self) -> None:
-        names = {field.name for field in dataclasses.fields(self)} - set(MEANS)
-        check_fields(self, at_least_zero=tuple(sorted(names)))
+        names = {field.name for field in dataclasses.fields(self)} - {*MEANS, "noise_max"}
+        check_fields(self, at_least_zero=tuple(sorted(names)), at_least_one=("noise_max",))
 
 
 class OdometerBias(eqx.Module):
@@ -116,8 +116,12 @@ def odometer_sigma(
 
 
 def sample_motion(
-    model: MotionModel, bias: OdometerBias, odometer: SE2, key: PRNGKeyArray
-) -> tuple[SE2, OdometerBias]:
+    model: MotionModel,
+    bias: OdometerBias,
+    odometer: SE2,
+    key: PRNGKeyArray,
+    inflation: Float[Array, "2"] | None = None,
+) -> tuple[SE2, OdometerBias, Float[Array, "*batch 2"]]:
     """Draw the motion of one particle or of many, and learn their systematic errors from the draw.
 
     The motion in distance and turn is z = u + A b + noise, where u is the reading; drawn from
@@ -126,8 +130,11 @@ def sample_motion(
     **Arguments:**
     - `bias`: beliefs, `mean[*batch, 4]`.
     - `odometer`: T_previous_current as read, metres and radians.
+    - `inflation`: by `adapt_odometer`, of the variance of distances and of turns. That of the
+      noise and of b alike, so that what a draw tells of b stays what it is.
 
-    **Returns:** T_previous_current drawn [*batch], and the beliefs given the draw.
+    **Returns:** T_previous_current drawn [*batch], the beliefs given the draw, and the draws of
+    distance and turn in standard deviations.
     """
     forward, sideways, turn = odometer.log()  # along the arc, so that half a turn's error bends it
     distance = jnp.abs(forward)
@@ -144,10 +151,11 @@ def sample_motion(
     covariance = bias.covariance + wander
     S = A @ covariance @ A.T + noise  # diagonal: distance and turn share no error
     sigma = safe_sqrt(jnp.diag(S))
+    inflated = sigma if inflation is None else sigma * jnp.sqrt(inflation)
     # one draw for all: a key for each particle costs more than the rest of this; the particles last
     # and by a product of matrices: it prevents XLA from drawing again for each consumer
     draw = jax.random.normal(key, (3, *bias.mean.shape[:-1]))
-    sigmas = jnp.append(sigma, model.lateral_noise * safe_sqrt(distance))
+    sigmas = jnp.append(inflated, model.lateral_noise * safe_sqrt(distance))
     noise = jnp.tensordot(draw, jnp.diag(sigmas), axes=(0, 0))
     innovation = noise[..., :2]
     moved = jnp.stack([forward, turn]) + bias.mean @ A.T + innovation
@@ -155,7 +163,33 @@ def sample_motion(
 
     gain = covariance @ A.T / jnp.where(sigma > 0, sigma, 1) ** 2
     learned = OdometerBias(bias.mean + innovation @ gain.T, covariance - gain @ A @ covariance)
-    return SE2.exp(jnp.stack([moved[..., 0], across, moved[..., 1]], axis=-1)), learned
+    motion = SE2.exp(jnp.stack([moved[..., 0], across, moved[..., 1]], axis=-1))
+    return motion, learned, jnp.moveaxis(draw[:2], 0, -1)
+
+
+def adapt_odometer(
+    model: MotionModel,
+    inflation: Float[Array, "2"],
+    prior: Float[Array, "N"],
+    posterior: Float[Array, "N"],
+    draws: Float[Array, "N 2"],
+    sound: Bool[Array, ""],
+) -> Float[Array, "2"]:
+    """The inflation of the odometer's variance (distance, turn) after an image; at least 1.
+
+    It grows where the particles that the image leaves had drawn more of the noise than others: by
+    E[z² | image] - E[z²], whose mean is 0 if the noise is as assumed, and also where an image
+    tells nothing. It is a step of expectation maximisation, damped.
+
+    **Arguments:**
+    - `prior`, `posterior`: weights before and after the image.
+    - `draws`: z, of `sample_motion`.
+    - `sound`: whether the images agree with the map. If not they are no witness of the odometer,
+      and the inflation fades.
+    """
+    surplus = jnp.minimum((posterior - prior) @ draws**2, MOST)
+    grown = jnp.where(sound, jnp.exp(model.adaptation * surplus) * inflation, inflation**FADING)
+    return jnp.clip(grown, 1, model.noise_max)
 
 
 def read_or_unknown(

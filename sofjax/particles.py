@@ -34,6 +34,14 @@ class Particles(eqx.Module):
             log_weight += chosen - jax.lax.stop_gradient(chosen)
         return Particles(T, bias, log_weight)
 
+    def moved_to(self, T_world_robot: SE2, bias: Float[Array, "4"]) -> "Particles":
+        """All moved alike, so that their weighted means are this pose and these errors."""
+        mean = mean_pose(self)
+        xy = self.T_world_robot.xy + (T_world_robot.xy - mean.xy)
+        yaw = self.T_world_robot.yaw + (T_world_robot.yaw - mean.yaw)
+        each = self.bias.mean + (bias - mean_bias(self))
+        return Particles(SE2(xy, yaw), OdometerBias(each, self.bias.covariance), self.log_weight)
+
 
 def effective_size(log_weight: Float[Array, "N"]) -> Float[Array, ""]:
     """1 / sum w² of normalised weights: N if all are equal, 1 if one has everything."""
@@ -108,6 +116,11 @@ def mean_pose(particles: Particles) -> SE2:
     """Weighted mean; of the yaw too, which is not wrapped and so has no jump within the cloud."""
     w = jnp.exp(particles.log_weight)
     return SE2(w @ particles.T_world_robot.xy, w @ particles.T_world_robot.yaw)
+
+
+def mean_bias(particles: Particles) -> Float[Array, "4"]:
+    """Weighted mean of the odometer's systematic errors."""
+    return jnp.exp(particles.log_weight) @ particles.bias.mean
 
 
 def pose_covariance(particles: Particles) -> Float[Array, "3 3"]:

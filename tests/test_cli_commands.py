@@ -19,7 +19,7 @@ from sofjax.cli import main
 from sofjax.io.drive import read_drive
 from sofjax.io.map_file import read_map
 from sofjax.io.trajectory import read_trajectory
-from sofjax.pipeline import results
+from sofjax.pipeline import RunSettings, results
 from sofjax.pipeline.online import views
 from sofjax.pipeline.run_log import RunLog
 
@@ -166,11 +166,11 @@ def test_where_nothing_seen_holds_the_distance_it_is_said(done):
     run_log = RunLog(stamps=list(drive.image_stamps[:21]), poses=poses, across=[0] * 21)
     run_log.across[:4], run_log.across[12] = [2, 1, 3, 1], 1
     assert run_log.longest_without_across == pytest.approx(9)
-    (said,) = results.warnings(drive, run_log)
+    (said,) = results.warnings(drive, run_log, RunSettings())
     assert said.startswith("for 9.0 m no line across the way") and "odometer" in said
     run_log.across[7] = run_log.across[9] = run_log.across[16] = 1
     assert run_log.longest_without_across == pytest.approx(4) and not results.warnings(
-        drive, run_log
+        drive, run_log, RunSettings()
     )
     assert RunLog().longest_without_across == 0
     assert report_of(done)["longest_without_lines_across_m"] < 1.5

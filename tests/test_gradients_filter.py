@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("x64")
 def drawn(p):
     model = eqx.tree_at(lambda m: (m.distance_noise, m.turn_noise), MotionModel(), (p[3], p[4]))
     bias = dataclasses.replace(prior_bias(MotionModel()), mean=p[5:9])
-    motion, learned = sample_motion(model, bias, SE2.exp(p[:3]), jax.random.key(0))
+    motion, learned, _ = sample_motion(model, bias, SE2.exp(p[:3]), jax.random.key(0))
     return motion, learned.mean, learned.covariance
 
 

@@ -32,7 +32,7 @@ def draws(model, odometer, mean=None):
     """Twists (forward, sideways, turn) of N particles, and what each has learned."""
     bias = prior_bias(model)
     means = jnp.broadcast_to(bias.mean if mean is None else jnp.array(mean, float), (N, 4))
-    motion, learned = sample(
+    motion, learned, _ = sample(
         model,
         OdometerBias(means, bias.covariance),
         odometer,
@@ -112,7 +112,7 @@ def test_what_was_learned_is_the_bayesian_regression_on_the_draws():
     weighted = np.zeros(4)
     for i in range(40):
         forward, turn = rng.uniform(-0.1, 0.5), rng.uniform(-0.5, 0.5)
-        motion, belief = sample(model, belief, reading(forward, 0.0, turn), jax.random.key(i))
+        motion, belief, _ = sample(model, belief, reading(forward, 0.0, turn), jax.random.key(i))
         moved, _, turned = np.asarray(motion.log())
         A = np.array([[forward, 0, 0, 0], [0, max(turn, 0), min(turn, 0), abs(forward)]])
         W = np.diag(1 / np.array([
@@ -143,7 +143,7 @@ def test_a_left_turn_teaches_nothing_about_right_turns_nor_a_turn_about_distance
 def test_systematic_errors_wander_with_the_way():
     """A belief far below its prior grows again by its drift, when the noise teaches nothing."""
     model = MotionModel(1e6, 0.0, 1e6, 1e6, 0.02, 0.05, 0.005, bias_drift=0.5)
-    _, learned = sample(
+    _, learned, _ = sample(
         model,
         OdometerBias(jnp.zeros(4), jnp.zeros((4, 4))),
         reading(2.0, 0.0, 0.1),
@@ -167,7 +167,7 @@ def test_many_particles_are_each_drawn_from_their_own_belief():
     odometer, key = reading(0.5, 0.0, 0.3), jax.random.key(5)
     alike = jnp.zeros((4, 4))
     of = lambda means: sample(LOUD, OdometerBias(means, bias.covariance), odometer, key)
-    (motion, learned), (other, other_learned) = of(alike), of(alike.at[2].set(0.01))
+    (motion, learned, _), (other, other_learned, _) = of(alike), of(alike.at[2].set(0.01))
     same = np.array([True, True, False, True])
     np.testing.assert_array_equal((motion.yaw == other.yaw), same)
     np.testing.assert_array_equal((motion.xy == other.xy).all(axis=1), same)

@@ -35,6 +35,7 @@ STATIC = {
     "filter.choice": ("winner", {}),
     "filter.gate_each": (True, {}),
     "filter.soft": (True, {}),
+    "filter.doubts": (False, {}),
     "sensor.propagate": (False, {}),
     "segment_map.rule": ("gamma", {}),
     "segment_map.classify": (False, {}),

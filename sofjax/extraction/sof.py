@@ -19,6 +19,7 @@ class View(eqx.Module):
 
     segments_image: Segments  # [M]
     T_world_robot: SE2
+    T_odometer: SE2  # the same by the odometer's readings alone
 
 
 class SofExtraction(eqx.Module):
@@ -123,9 +124,9 @@ def extract_along(
             config, camera, mount, view.segments_image, second,
             view.T_world_robot.between(T_world_robot), max_depth,
         )  # fmt: skip
-        kept = keep_views(config, recent, reference, View(second, T_world_robot))
+        kept = keep_views(config, recent, reference, View(second, T_world_robot, T_world_robot))
         return (T_world_robot, *kept), (found, view.segments_image.valid.any())
 
     start = jax.tree.map(lambda a: jnp.zeros_like(a[0]), (log.motion, log.segments_image))
-    none = View(start[1], start[0])
+    none = View(start[1], start[0], start[0])
     return jax.lax.scan(next_image, (start[0], none, none), log)[1]

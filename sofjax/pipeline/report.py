@@ -61,6 +61,7 @@ def report_of(
             "lost": run_log.step["lost"],
             "unreadable": run_log.unreadable,
         },
+        "noise": run_log.noise | {"images_given_up": result.given_up},
         "longest_without_lines_across_m": run_log.longest_without_across,
         "loop": result.loop,
         "frames_per_second": run_log.frames_per_second,

@@ -28,6 +28,8 @@ from sofjax.segment_map import FinalMap, final_map
 from sofjax.slam.state import SlamState
 
 UNOBSERVED = 5.0  # metres; R, within which a line across the heading is mapped and seen again
+MOST_GIVEN_UP = 0.2  # share of the images; with more the run says so, ...
+SOME = 20  # ... if there are so many
 MOST_ON_FLOOR = 0.5  # share of the segments on the floor's side; with less the set-up is checked
 
 
@@ -84,6 +86,11 @@ class DriveResult:
         return self.closed.trajectory if self.closed else self.online
 
     @property
+    def given_up(self) -> int:
+        """Images whose segments the odometer alone decided against."""
+        return given_up(self.log, self.settings)
+
+    @property
     def stopped(self) -> bool:
         """Whether Ctrl-C or a full disk ended the drive or what is solved after it."""
         return self.interrupted or self.loop.get("status") == LoopStatus.INTERRUPTED
@@ -112,7 +119,7 @@ def find_results(
     drive, run_log = driven.drive, driven.log
     of_map = map_segments(driven, closed)
     errors = compare(drive, run_log, closed, of_map.segments) if run_log.stamps else Errors()
-    found = [*warnings(drive, run_log), *errors.warnings, *remarks]
+    found = [*warnings(drive, run_log, driven.settings), *errors.warnings, *remarks]
     if status == LoopStatus.INTERRUPTED and not driven.interrupted:
         found.append("interrupted while solving; the map is as it was after the drive")
     loop: dict[str, object] = {"asked": driven.settings.loop}
@@ -177,7 +184,15 @@ def doubts_of(drive: Drive, settings: RunSettings, run_log: RunLog) -> list[str]
     return found
 
 
-def warnings(drive: Drive, run_log: RunLog) -> list[str]:
+def given_up(run_log: RunLog, settings: RunSettings) -> int:
+    """Images that contradicted the map or the odometer more than noise explains."""
+    beyond = np.array(run_log.sensor_inflation) > float(settings.slam.sensor.noise_gate)
+    if settings.slam.filter.doubting:
+        beyond |= np.logical_not(run_log.trusted) & (np.array(run_log.floor_side) > 0)
+    return int(beyond.sum())
+
+
+def warnings(drive: Drive, run_log: RunLog, settings: RunSettings) -> list[str]:
     """Sentences on what was odd about the drive."""
     found = setup_checks.of_drive(drive) + run_log.doubts
     n = len(run_log.stamps)
@@ -204,6 +219,13 @@ def warnings(drive: Drive, run_log: RunLog) -> list[str]:
             "more lines lay within sight than are compared, "
             f"{run_log.step['map_truncated']} too many in {n} images; "
             "segment_map.nearby makes room"
+        )
+    contradicting = given_up(run_log, settings)
+    if contradicting > max(MOST_GIVEN_UP * n, SOME):
+        found.append(
+            "the images contradict the map or the odometer more than noise explains, over "
+            f"{contradicting} of {n} images; the odometer alone decided there: "
+            "run `sofjax calibrate robot`"
         )
     if run_log.longest_without_across > UNOBSERVED:
         found.append(

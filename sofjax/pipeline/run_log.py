@@ -36,6 +36,10 @@ class RunLog:
     poses: list[np.ndarray] = field(default_factory=list)  # (x, y, yaw), metres, radians
     observations: list[Observation] = field(default_factory=list)  # on the host
     jitter: list[np.ndarray] = field(default_factory=list)  # (pitch, roll), radians
+    sensor_inflation: list[float] = field(default_factory=list)  # of the pixels' variance
+    odometer_inflation: list[np.ndarray] = field(default_factory=list)  # of (distance, turn)
+    floor_side: list[int] = field(default_factory=list)  # segments below the horizon
+    trusted: list[bool] = field(default_factory=list)  # the image showed the odometer's motion
     across: list[int] = field(default_factory=list)  # matched lines across the heading
     bias: np.ndarray | None = None  # the odometer's errors at last
     faults: dict[str, list[str]] = field(default_factory=dict)  # files that tell nothing, by why
@@ -67,6 +71,10 @@ class RunLog:
         self.poses.append(pose)
         self.observations.append(jax.device_get(frame.observation))
         self.jitter.append(np.asarray(info.jitter))
+        self.sensor_inflation.append(float(info.sensor_inflation))
+        self.odometer_inflation.append(np.asarray(info.odometer_inflation))
+        self.floor_side.append(int(info.below_horizon))
+        self.trusted.append(bool(info.trusted))
         self.across.append(int(info.across))
         self.bias = np.asarray(info.bias)
         if view.fault:
@@ -89,6 +97,15 @@ class RunLog:
     def odometer(self) -> dict[str, float]:
         """The odometer's errors as they were learned at last, by name."""
         return {} if self.bias is None else dict(zip(BIAS, map(float, self.bias), strict=True))
+
+    @property
+    def noise(self) -> dict[str, object]:
+        """The largest inflation of the variances of sensor and odometer, against the model."""
+        distance, turn = np.max(self.odometer_inflation, axis=0, initial=1.0).tolist()
+        return {
+            "sensor_inflation": max(self.sensor_inflation, default=1.0),
+            "odometer_inflation": {"distance": distance, "turn": turn},
+        }
 
     @property
     def trajectory(self) -> Trajectory:

@@ -5,7 +5,7 @@ from jaxtyping import PRNGKeyArray
 
 from sofjax.extraction.sof import View, keep_views
 from sofjax.likelihood.tracking import adapt_inflation
-from sofjax.particles import effective_size, pose_covariance
+from sofjax.particles import effective_size, mean_bias, pose_covariance
 from sofjax.slam.choose import Chosen
 from sofjax.slam.config import Setup
 from sofjax.slam.extract import Extracted
@@ -32,7 +32,7 @@ def advance(
     known, error = updated.known, chosen.score.error
     recent, reference = keep_views(
         config.association, state.recent, state.reference,
-        View(extracted.segments_image, chosen.T_world_robot),
+        View(extracted.segments_image, chosen.T_world_robot, extracted.consistency.T_odometer),
     )  # fmt: skip
     misfit = jnp.where(known, error, 0).sum() / jnp.maximum(known.sum(), 1).astype(float)
     inflation = jnp.where(
@@ -46,13 +46,16 @@ def advance(
     info = StepInfo(
         T_world_robot=chosen.T_world_robot,
         covariance=pose_covariance(chosen.weighted),
-        bias=jnp.exp(chosen.weighted.log_weight) @ chosen.weighted.bias.mean,
+        bias=mean_bias(chosen.weighted),
         effective_size=effective_size(weighted.particles.log_weight),
         log_evidence=weighted.log_evidence,
         jitter=chosen.score.jitter,
         misfit=misfit,
+        sensor_inflation=inflation,
+        odometer_inflation=weighted.odometer_inflation,
+        trusted=extracted.consistency.trusted,
         detected=detected.sum(),
-        below_horizon=measurements.valid.sum(),
+        below_horizon=extracted.seen.sum(),
         associated=extracted.is_sof.sum(),
         reobserved=(extracted.is_sof & known).sum(),
         matched=known.sum(),
@@ -61,10 +64,10 @@ def advance(
         map_overflow=updated.overflow,
         map_truncated=local.truncated,
         lost=unmatched >= LOST_AFTER,
-        segment_class=detected.astype(int) + measurements.valid.astype(int) + on_floor.astype(int),
+        segment_class=detected.astype(int) + extracted.seen.astype(int) + on_floor.astype(int),
     )
     after = SlamState(
-        chosen.particles, updated.segment_map, recent, reference, inflation, unmatched, key,
-        state.window,
+        chosen.particles, updated.segment_map, recent, reference, inflation,
+        weighted.odometer_inflation, extracted.consistency, unmatched, key, state.window,
     )  # fmt: skip
     return after, info

@@ -12,6 +12,7 @@ from sofjax.likelihood.tracking import Score, nothing_seen, score
 from sofjax.particles import (
     Particles,
     effective_size,
+    mean_bias,
     mean_pose,
     most_likely,
     resample_observable,
@@ -70,6 +71,7 @@ def choose(
 
     def resampled() -> Particles:
         drawn = particles.take(systematic(offsets[2], particles.log_weight), config.soft)
+        drawn = drawn.moved_to(T_world_robot, mean_bias(particles))  # no chance in the mean
         return jax.tree.map(lambda a, b: jnp.where(few, a, b), drawn, particles)
 
     survivors = jax.lax.cond(in_any_run(few), resampled, lambda: particles)

@@ -27,6 +27,9 @@ class FilterConfig(eqx.Module):
         static=True, default=False
     )  # Fig. 6, step 4: SoF for every particle
     soft: bool = eqx.field(static=True, default=False)  # for derivatives; see `SofSlam.run`
+    doubts: bool = eqx.field(
+        static=True, default=True
+    )  # images that contradict the odometer are not used; never with `soft`
     max_depth: float = 8.0  # camera heights: farther segments are not used
 
     def __check_init__(self) -> None:
@@ -37,6 +40,11 @@ class FilterConfig(eqx.Module):
             at_least_zero=("effective_share",),
             positive=("max_depth",),
         )
+
+    @property
+    def doubting(self) -> bool:
+        """Whether images are compared with the odometer's reading; a density has no such choice."""
+        return self.doubts and not self.soft
 
 
 class FixedLagConfig(eqx.Module):

@@ -14,7 +14,7 @@ from sofjax.likelihood.measurements import Measurements, measure
 from sofjax.likelihood.tracking import pixels_and_weight
 from sofjax.slam.config import Setup
 from sofjax.slam.predict import Predicted
-from sofjax.slam.state import SlamState
+from sofjax.slam.state import Consistency, SlamState
 
 
 class Extracted(eqx.Module):
@@ -23,9 +23,11 @@ class Extracted(eqx.Module):
     segments_image: Segments
     measurements: Measurements
     view: View  # the earlier image that eq. (9) compares with
+    seen: Bool[Array, "M"]  # on the floor's side of the horizon and within range, trusted or not
     is_sof: Bool[Array, "M"]  # on the floor by eq. (9), from the predicted pose
     used: Bool[Array, "N M"] | Float[Array, "N M"]  # what counts for each particle, or how much
     weight: Float[Array, ""]  # of the log-likelihood
+    consistency: Consistency  # whether the image shows the odometer's motion
 
 
 def extract_sof(
@@ -48,7 +50,10 @@ def extract_sof(
     else:
         used = measurements.valid[None]
     used = jnp.broadcast_to(used, (config.filter.particles, used.shape[1]))
-    return Extracted(segments_image, measurements, view, is_sof, used, weight)
+    return Extracted(
+        segments_image, measurements, view, measurements.valid, is_sof, used, weight,
+        state.consistency,
+    )  # fmt: skip
 
 
 def sof_from(

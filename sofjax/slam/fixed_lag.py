@@ -70,12 +70,26 @@ def with_fixed_lag(one_round: Round) -> Callable[..., tuple[SlamState, StepInfo]
         T_world_robot = T_new_old @ info.T_world_robot
         recent, reference = keep_views(
             setup.config.association, state.recent, state.reference,
-            View(observation.segments_image, T_world_robot),
+            View(observation.segments_image, T_world_robot, after.consistency.T_odometer),
         )  # fmt: skip
         after = eqx.tree_at(
-            lambda s: (s.particles.T_world_robot, s.segment_map, s.recent, s.reference, s.window),
+            lambda s: (
+                s.particles.T_world_robot,
+                s.consistency.T_world_robot,
+                s.segment_map,
+                s.recent,
+                s.reference,
+                s.window,
+            ),
             after,
-            (T_new_old @ after.particles.T_world_robot, segment_map, recent, reference, window),
+            (
+                T_new_old @ after.particles.T_world_robot,
+                T_new_old @ after.consistency.T_world_robot,
+                segment_map,
+                recent,
+                reference,
+                window,
+            ),
         )
         return after, eqx.tree_at(lambda i: i.T_world_robot, info, T_world_robot)
 

@@ -34,7 +34,14 @@ def update_map(
     known = best.error < sensor.e_max
     unlike = local.nearest > sensor.e_max
     counted = counted_from(setup, extracted, T_world_robot)
-    new = extracted.is_sof & unlike & counted & ~known & jnp.logical_not(measurements.upright)
+    new = (
+        extracted.is_sof
+        & measurements.valid
+        & unlike
+        & counted
+        & ~known
+        & jnp.logical_not(measurements.upright)
+    )
     seen = in_view(config, setup.camera, setup.mount, local.lines, T_world_robot)
     observed = Observed(
         measurements, best.jitter, T_world_robot @ setup.mount.T_robot_nadir,

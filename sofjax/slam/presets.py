@@ -18,6 +18,7 @@ PAPER = SlamConfig(
         turn_scale_sigma=0.0,
         curvature_sigma=0.0,
         slip_rate=0.0,
+        adaptation=0.0,
     ),
     sensor=SensorModel(
         propagate=False, rho_sigma=0.05, theta_sigma=0.035, tilt_sigma=0.0, upright=0.0
@@ -30,7 +31,7 @@ PAPER = SlamConfig(
         merge_distance=0.05,
         min_share=0.0,
     ),
-    filter=FilterConfig(choice="winner", gate_each=True),
+    filter=FilterConfig(choice="winner", gate_each=True, doubts=False),
     lengths="metres",
 )
 

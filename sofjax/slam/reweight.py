@@ -10,6 +10,7 @@ from sofjax.geometry.se2 import SE2
 from sofjax.likelihood.density import log_density
 from sofjax.likelihood.measurements import Measurements
 from sofjax.likelihood.tracking import Candidates, Precomputed, precompute, score
+from sofjax.motion import adapt_odometer
 from sofjax.particles import Particles
 from sofjax.segment_map import SegmentMap, candidate_associations, in_view, nearby
 from sofjax.slam.config import Setup
@@ -61,6 +62,7 @@ class Weighted(eqx.Module):
     particles: Particles
     log_likelihood: Float[Array, "N"]
     log_evidence: Float[Array, ""]  # log of the mean likelihood, weighted by the prior
+    odometer_inflation: Float[Array, "2"]  # as the particles that are left tell of it
 
 
 def reweight(setup: Setup, predicted: Predicted, extracted: Extracted, local: LocalMap) -> Weighted:
@@ -76,7 +78,13 @@ def reweight(setup: Setup, predicted: Predicted, extracted: Extracted, local: Lo
     log_weight = particles.log_weight + log_likelihood
     log_evidence = jax.nn.logsumexp(log_weight)
     weighted = Particles(particles.T_world_robot, particles.bias, log_weight - log_evidence)
-    return Weighted(weighted, log_likelihood, log_evidence)
+    inflation = predicted.odometer_inflation
+    if not setup.config.filter.soft:  # whose evidence is of the noise as it is set
+        inflation = adapt_odometer(
+            setup.config.motion, inflation, jnp.exp(particles.log_weight),
+            jnp.exp(weighted.log_weight), predicted.draws, predicted.sensor_is_sound,
+        )  # fmt: skip
+    return Weighted(weighted, log_likelihood, log_evidence, inflation)
 
 
 def hard_log_likelihood(

@@ -15,6 +15,20 @@ from sofjax.segment_map import SegmentMap, empty_map
 from sofjax.slam.config import Setup
 from sofjax.slam.keyframes import Window, empty_window
 
+FIRST_WAIT = 50.0  # images that must agree before they are used again; then twice as many
+
+
+class Consistency(eqx.Module):
+    """Whether the images showed, of late, the motion that the wheels read."""
+
+    counts: Float[Array, "4"]  # segments: all, moving as read, by chance, and standing still
+    trusted: Bool[Array, ""]  # the images are used
+    wait: Float[Array, ""]  # images that must agree until they are; ...
+    next_wait: Float[Array, ""]  # ... after the next time that they are given up
+    T_odometer: SE2  # the odometer's readings alone, from the start
+    T_world_robot: SE2  # by the odometer since the images last confirmed a turn, ...
+    bias: Float[Array, "4"]  # ... with its errors as they were learned until then
+
 
 class SlamState(eqx.Module):
     """What is carried from one image to the next."""
@@ -24,6 +38,8 @@ class SlamState(eqx.Module):
     recent: View  # the last two views kept, a baseline apart
     reference: View
     variance_inflation: Float[Array, ""]  # of the measurements, against the sensor model; >= 1
+    odometer_inflation: Float[Array, "2"]  # of the variance of distances and of turns; >= 1
+    consistency: Consistency
     unmatched: Int[Array, ""]  # images in a row without one known segment
     key: PRNGKeyArray
     window: Window | None  # with a fixed lag
@@ -39,6 +55,9 @@ class StepInfo(eqx.Module):
     log_evidence: Float[Array, "*batch"]  # log of the mean likelihood of the particles, weighted
     jitter: Float[Array, "*batch 2"]  # attitude jitter (pitch, roll) of the image, radians
     misfit: Float[Array, "*batch"]  # mean error e of the matched segments; 2 if sigmas are true
+    sensor_inflation: Float[Array, "*batch"]  # of the pixels' variance after the image; >= 1
+    odometer_inflation: Float[Array, "*batch 2"]  # of that of distances and of turns; >= 1
+    trusted: Bool[Array, "*batch"]  # the images showed the motion that the wheels read
     detected: Int[Array, "*batch"]
     below_horizon: Int[Array, "*batch"]  # on the floor's side of the horizon and within range
     associated: Int[Array, "*batch"]  # of them, by eq. (9)
@@ -50,6 +69,15 @@ class StepInfo(eqx.Module):
     map_truncated: Int[Array, "*batch"]  # lines in view beyond the L that are compared
     lost: Bool[Array, "*batch"]
     segment_class: Int[Array, "*batch M"]  # 0 none, 1 above the horizon, 2 not floor, 3 floor
+
+
+def no_consistency() -> Consistency:
+    """Before the first image, and where it is not asked: `FilterConfig.doubts`."""
+    none, still = jnp.zeros(()), SE2.identity()
+    return Consistency(
+        jnp.zeros(4), jnp.zeros((), bool), none, jnp.full((), FIRST_WAIT), still, still,
+        jnp.zeros(4),
+    )  # fmt: skip
 
 
 def initial_state(setup: Setup, key: PRNGKeyArray, capacity: int) -> SlamState:
@@ -70,7 +98,8 @@ def initial_state(setup: Setup, key: PRNGKeyArray, capacity: int) -> SlamState:
         OdometerBias(jnp.broadcast_to(bias.mean, (N, 4)), bias.covariance),
         jnp.full(N, -jnp.log(N), float),
     )
-    none = View(Segments(jnp.zeros((capacity, 2, 2)), jnp.zeros(capacity, bool)), SE2.identity())
+    still = SE2.identity()
+    none = View(Segments(jnp.zeros((capacity, 2, 2)), jnp.zeros(capacity, bool)), still, still)
     window = None
     if config.window.keyframes:
         nothing = measure(
@@ -78,8 +107,8 @@ def initial_state(setup: Setup, key: PRNGKeyArray, capacity: int) -> SlamState:
         )
         window = empty_window(config.window, config.segment_map.capacity, nothing)
     return SlamState(
-        particles, empty_map(config.segment_map), none, none, jnp.ones(()), jnp.zeros((), int),
-        key, window,
+        particles, empty_map(config.segment_map), none, none, jnp.ones(()), jnp.ones(2),
+        no_consistency(), jnp.zeros((), int), key, window,
     )  # fmt: skip
 
 

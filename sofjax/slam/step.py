@@ -7,6 +7,7 @@ from sofjax.extraction.observation import Observation
 from sofjax.slam.advance import advance
 from sofjax.slam.choose import choose
 from sofjax.slam.config import Setup
+from sofjax.slam.consistency import doubt, through_unread
 from sofjax.slam.extract import extract_sof
 from sofjax.slam.fixed_lag import Mapped, with_fixed_lag
 from sofjax.slam.map_update import update_map
@@ -24,10 +25,13 @@ def one_round(
     predicted = predict(setup, state, observation, key_motion, key_slip)
     # 4) put the segments on the floor, and extract SoF (Fig. 5) against a view a baseline away
     extracted = extract_sof(setup, state, observation, predicted)
+    if setup.config.filter.doubting:
+        predicted, extracted = doubt(setup, state, predicted, extracted)
     # 5) compare with the map by the sensor model, and choose
     local = local_map(setup, state.segment_map, extracted.measurements, predicted.T_world_robot)
     weighted = reweight(setup, predicted, extracted, local)
     chosen = choose(setup, predicted, extracted, local, weighted, key_choice)
+    extracted = through_unread(state, predicted, extracted, chosen.T_world_robot)
     # 6) integrate the observed segments into the map, as seen from the chosen pose
     updated = update_map(setup, state.segment_map, extracted, local, chosen)
     # 7) the next round starts from here
