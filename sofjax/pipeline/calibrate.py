@@ -254,6 +254,6 @@ def _jointly(found: DriveFit, log: Observation, free: tuple[str, ...]) -> tuple[
     # residuals of one line, one image, one odometer are not independent: the joint solve's own
     # covariance is too narrow by far
     return (
-        dataclasses.replace(jax.device_get(rig), mount=mount),
+        jax.device_get(dataclasses.replace(rig, mount=solved.mount)),
         found.covariance + np.outer(difference, difference),
     )
