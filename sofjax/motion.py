@@ -44,7 +44,7 @@ class MotionModel(eqx.Module):
     slip_rate: float = 0.003  # slips per metre; none of the above covers a wheel that spins
     slip_distance: float = 0.01  # metres, standard deviation of a slip
     slip_turn: float = 0.05  # radians, standard deviation of a slip
-    adaptation: float = 0.3  # share of the surplus by which the variance inflates in a step
+    adaptation: float = 0.1  # share of the surplus by which the variance inflates in a step
     noise_max: float = 1e4  # variance inflation up to which the odometer may be worse than all this
 
     def __check_init__(self) -> None:
