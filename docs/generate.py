@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 
 from sofjax.pipeline import RunSettings
+from sofjax.slam import SlamConfig
 
 MODULES = {  # the API page, from the ground up
     "sofjax.geometry": "The ground: eqs. (1) to (8) and (10) to (13)",
@@ -75,6 +76,8 @@ def settings_page() -> str:
     ]
     comments = field_comments(RunSettings)
     own = [(name, getattr(RunSettings(), name), comments[name]) for name in ("seed", "loop")]
+    lengths = field_comments(SlamConfig)["lengths"]
+    own += [("lengths", SlamConfig().lengths, f"what lengths of the settings are in: {lengths}")]
     out += ["## A run", _rows(own)]
     for prefix, (module, name) in SETTINGS.items():
         kind = getattr(importlib.import_module(module), name)

@@ -41,6 +41,11 @@ def _of_batch(
     return in_any_run(condition.any()), False
 
 
+def float_of(number: ArrayLike) -> ArrayLike:
+    """A scalar as Python's own number, which takes the precision of what it meets."""
+    return np.asarray(number).item()
+
+
 def in_double(tree: Tree) -> Tree:
     """The tree with its floating point leaves in float64; to be called where x64 is enabled."""
 

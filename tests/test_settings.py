@@ -44,6 +44,7 @@ STATIC = {
     "segment_map.nearby": (7, {}),
     "segment_map.candidates": (2, {}),
     "window.keyframes": (3, WINDOW),
+    "lengths": ("metres", {}),
     "window.lines": (9, WINDOW),
 }
 OF_THE_RUN = ("seed", "loop")

@@ -115,7 +115,12 @@ def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict[str, float]
     import jax.numpy as jnp
 
     from sofjax.geometry import Camera
-    from sofjax.io.camera_file import TO_FILL_IN, check_floor_in_view, write_intrinsics
+    from sofjax.io.camera_file import (
+        TO_FILL_IN,
+        RigFields,
+        check_floor_in_view,
+        write_intrinsics,
+    )
 
     missing = [key for key in TO_FILL_IN if key not in mount]
     if not missing:
@@ -125,10 +130,20 @@ def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict[str, float]
     notes = [f"from {views} views of a {board} board", *numbers(fit)]
     distortion = fit.distortion.round(7)
     name = path.resolve().parent.name  # as a camera without a name is called
-    write_intrinsics(path, camera, "plumb_bob", distortion, name, mount, notes)
+    known = RigFields(sigma=known_to(fit))
+    write_intrinsics(path, camera, "plumb_bob", distortion, name, mount, notes, known)
     print(f"written to {path}")
     if missing:
         print(f"before a run, fill in the {' and the '.join(missing)} of its mount")
+
+
+def known_to(fit: "CameraFit") -> dict[str, float]:
+    """Standard deviations of what `calibrate robot` may fit anew, in its units."""
+    fx, _, cx, cy = fit.intrinsics_sigma
+    f = fit.intrinsics[0]
+    k1, k2, *_ = fit.distortion_sigma
+    sigma = {"focal": fx / f, "cx": cx / f, "cy": cy / f, "k1": k1, "k2": k2}
+    return {name: float(f"{value:.3g}") for name, value in sigma.items() if value > 0}
 
 
 def numbers(fit: "CameraFit") -> list[str]:

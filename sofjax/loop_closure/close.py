@@ -4,7 +4,9 @@ import dataclasses
 import math
 
 import equinox as eqx
+import jax
 
+from sofjax._pytree import float_of
 from sofjax.extraction.observation import Observation
 from sofjax.geometry.camera import Camera, Mount
 from sofjax.loop_closure.place_recognition import ClosingConfig
@@ -39,7 +41,8 @@ def close(
 
     Arguments are those of `smoothing.smooth`.
     """
-    asked, config = [], config.in_metres(camera, mount)
+    asked = []
+    config = jax.tree.map(float_of, config.in_metres(camera, mount))  # for either precision
     for _ in range(SOLUTIONS):
         done = smooth(config, camera, mount, log, path, segment_map, rules)
         final = final_map(config.segment_map, done)

@@ -101,7 +101,7 @@ class RunLog:
     @property
     def noise(self) -> dict[str, object]:
         """The largest inflation of the variances of sensor and odometer, against the model."""
-        distance, turn = np.max(self.odometer_inflation, axis=0, initial=1.0).tolist()
+        distance, turn = np.max([np.ones(2), *self.odometer_inflation], axis=0).tolist()
         return {
             "sensor_inflation": max(self.sensor_inflation, default=1.0),
             "odometer_inflation": {"distance": distance, "turn": turn},

@@ -21,7 +21,7 @@ class MapConfig(eqx.Module):
     )  # estimate the apparent scale, tell floor from off-floor
     directed: bool = eqx.field(static=True, default=False)  # tell a line's edges apart
     capacity: int = eqx.field(static=True, default=1024)  # K, lines that the map has room for
-    nearby: int = eqx.field(static=True, default=256)  # map lines that an image may show, at most
+    nearby: int = eqx.field(static=True, default=384)  # map lines that an image may show, at most
     candidates: int = eqx.field(static=True, default=4)  # C, map lines compared per measurement
     range: float = 5.0  # R, camera heights: what is farther does not extend a segment
     length: float = 10.0  # L = 2 R, camera heights: a longer segment rests

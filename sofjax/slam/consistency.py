@@ -43,6 +43,7 @@ def consistency(
     told = as_read - by_chance > SURE * jnp.sqrt(as_read + by_chance)
     contradiction = (still - as_read) / jnp.maximum(seen, 1)
     agrees = told & (contradiction < jnp.where(before.trusted, CONTRADICTED, AGREED))
+    agrees = agrees | (seen == 0)  # an odometer that has read nothing contradicts nothing
     wait = jnp.where(agrees, jnp.maximum(before.wait - 1, 0), before.wait)
     trusted = agrees & (wait == 0)
     given_up = before.trusted & ~trusted
