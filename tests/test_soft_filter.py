@@ -31,9 +31,11 @@ RULES = dataclasses.replace(
 CONFIG = dataclasses.replace(
     DEFAULT, filter=RULES, segment_map=dataclasses.replace(DEFAULT.segment_map, capacity=K)
 )
+# the soft filter keeps the noise that it is given, and the drive turns to the left alone
+NOT_READ = ("adaptation", "noise_max", "right_error")
 VARIABLES = (
     *(("association", name) for name in ("alpha", "beta", "gate", "temperature")),
-    *(("motion", field.name) for field in dataclasses.fields(CONFIG.motion)),
+    *(("motion", f.name) for f in dataclasses.fields(CONFIG.motion) if f.name not in NOT_READ),
     *(("sensor", name) for name in ("pixel_sigma", "tilt_sigma")),
 )
 
