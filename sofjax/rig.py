@@ -101,7 +101,10 @@ class Rig(eqx.Module):
 
 
 def exposure(around: Float[Array, "L 3"], seconds: Float[Array, ""]) -> SE2:
-    """The motion from the stamp to a moment after it, of what the odometer read around it."""
+    """The motion from the stamp to a moment after it, of what the odometer read around it.
+
+    Beyond the first and the last of `LAGS` it is that to the first or the last.
+    """
     step = LAGS[1] - LAGS[0]
     at = jnp.clip((seconds - LAGS[0]) / step, 0, len(LAGS) - 1)
     i = jnp.clip(at.astype(int), 0, len(LAGS) - 2)
@@ -137,7 +140,8 @@ def retaken(
     - `around`: `Observation.around` of the image; None if nothing is known of it.
     - `point`: pixels of the image that was undistorted by the given lens.
 
-    **Returns:** pixels of the image undistorted by the right one.
+    **Returns:** pixels of the image undistorted by the right one; finite and without meaning for a
+    point that the rows' motion takes behind the camera.
     """
     to_pixels = lambda camera, n: (camera.K @ jnp.append(n, 1.0))[:2]
     to_normal = lambda camera, x: (jnp.linalg.inv(camera.K) @ jnp.append(x, 1.0))[:2]
@@ -150,8 +154,8 @@ def retaken(
     late = rig.time_offset - given.time_offset
     seen = exposure(around, late + raw[1] * (rig.line_delay - given.line_delay))
     T_seen_stamp = seen.inverse() @ exposure(around, late)
-    u, v, depth = two_view_homography(rig.camera, rig.mount, T_seen_stamp) @ jnp.append(x, 1.0)
-    return jnp.stack([u, v]) / jnp.where(depth > 0.1, depth, 1.0)
+    u, v, ratio = two_view_homography(rig.camera, rig.mount, T_seen_stamp) @ jnp.append(x, 1.0)
+    return jnp.stack([u, v]) / jnp.where(ratio > 0.1, ratio, 1.0)  # of the depths, near 1
 
 
 def corrected(given: Rig, rig: Rig, log: Observation) -> Observation:

@@ -176,10 +176,15 @@ def test_a_mount_that_is_not_measured_yet_is_asked_for(boards, tmp_path):
     with pytest.raises(InputError, match="fill in the radians that the camera looks down"):
         read_camera(out)
     assert known_mount(out) == {"x": 0, "y": -0.02, "height": 0.6, "roll": 0, "yaw": 0}
-    out.write_text(out.read_text().replace("fill in the radians that the camera looks down", "0.3"))
+    text = out.read_text().replace("fill in the radians that the camera looks down", "0.3")
+    text = text.replace("sigma: {", "sigma: {height: 0.01, ")
+    out.write_text(f"{text}time_offset: -0.11\nodometer: {{left: 0.02}}\n")
     assert main(args) == 0  # what the file has already is kept
-    mount = read_camera(out).mount
+    file = read_camera(out)
+    mount, fields = file.mount, file.rig_fields
     assert float(mount.pitch) == pytest.approx(0.3) and float(mount.y) == pytest.approx(-0.02)
+    assert fields.time_offset == -0.11 and fields.odometer == (0, 0.02, 0, 0)
+    assert fields.sigma["height"] == 0.01 and 0 < fields.sigma["focal"] < 0.05
 
 
 def fitted_views(board, views):

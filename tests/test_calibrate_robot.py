@@ -14,7 +14,7 @@ from test_calibrate_mount import OFFICE, make_drive
 
 import sofjax.pipeline.calibrate as calibrate
 from sofjax.calibration import MOUNT, TURNS, UNKNOWNS, DriveFitConfig, fit_drive
-from sofjax.calibration.assessment import accuracy
+from sofjax.calibration.assessment import accuracy, grade, too_wide
 from sofjax.calibration.fit_drive import CONTRADICTED, contradicted
 from sofjax.cli import main, summaries
 from sofjax.cli.calibrate_robot import free_names
@@ -189,8 +189,8 @@ def test_with_everything_right_the_file_s_numbers_come_back(recorded, capfd):
     for a, b in zip(*(jax.tree.leaves((f.camera, f.mount)) for f in (before, after)), strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(after.distortion, before.distortion)
-    assert after.clock.time_offset == 0 and after.clock.line_delay == 1.1e-5
-    assert after.clock.sigma["height"] < 0.01 and after.clock.sigma["pitch"] < 0.005
+    assert after.rig_fields.time_offset == 0 and after.rig_fields.line_delay == 1.1e-5
+    assert after.rig_fields.sigma["height"] < 0.01 and after.rig_fields.sigma["pitch"] < 0.005
     said = capfd.readouterr().out
     (line,) = re.findall("as given  (.*)", said)
     assert "focal" in line and "nothing contradicts" in line
@@ -277,3 +277,12 @@ def test_the_next_command_is_one_to_type(tmp_path):
     said = summaries.next_command("run", drive, put=out)
     assert said == f"next: cp {out} '{drive}'/camera.yaml, then sofjax run '{drive}'"
     assert summaries.next_command("run", drive, put=drive / "camera.yaml").count("cp ") == 0
+
+
+def test_a_mount_that_is_known_too_little_is_refused_with_what_to_drive():
+    C = np.diag([0.14**2, np.radians(3.9) ** 2, 1e-8, *[0.0] * (len(UNKNOWNS) - 3)])
+    assert grade(C) == "not usable"
+    said = too_wide(C, "").sentence
+    assert "the height (known to 14 %) and the pitch (known to 3.9°)" in said
+    assert "drive some metres" in said and "roll (" not in said
+    assert too_wide(C, "the clock is late").sentence.endswith("the clock is late")

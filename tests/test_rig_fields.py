@@ -16,7 +16,7 @@ from sofjax.io.camera_file import read_camera, write_camera
 from sofjax.io.drive import motions, read_drive, ways_around
 from sofjax.io.errors import InputError
 from sofjax.io.rig_fields import RigFields
-from sofjax.io.settings import to_dict
+from sofjax.io.settings import to_dict, with_settings
 from sofjax.io.trajectory import TrajectoryWriter
 from sofjax.motion import prior_bias
 from sofjax.pipeline import RunSettings
@@ -46,7 +46,7 @@ def read(tmp_path):
 
 def test_the_fields_are_read(read):
     file = read(FIELDS)
-    assert file.clock == RigFields(
+    assert file.rig_fields == RigFields(
         -0.11, 2.5e-5, (0.02, -0.01, 0.03, 0.002),
         {"height": 0.012, "focal": 0.004, "time_offset": 0.003, "left": 0.01},
     )  # fmt: skip
@@ -58,11 +58,11 @@ def test_the_fields_are_read(read):
 def test_what_is_not_there_is_zero_and_is_not_written(read, tmp_path):
     for text in ("", "time_offset:\nline_delay: null\nodometer: {}\nsigma:\n"):
         file = read(text)
-        assert file.clock == RigFields()
+        assert file.rig_fields == RigFields()
         write_camera(tmp_path / "again.yaml", file)
         written = (tmp_path / "again.yaml").read_text()
         assert not any(word in written for word in ("time_offset", "odometer", "sigma", "delay"))
-    assert read("odometer: {left: 0.02}\n").clock.odometer == (0.0, 0.02, 0.0, 0.0)
+    assert read("odometer: {left: 0.02}\n").rig_fields.odometer == (0.0, 0.02, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -77,8 +77,8 @@ def test_what_is_not_there_is_zero_and_is_not_written(read, tmp_path):
     ],
 )
 def test_what_is_written_is_read_back_number_for_number(read, tmp_path, clock):
-    write_camera(tmp_path / "again.yaml", dataclasses.replace(read(""), clock=clock))
-    assert read_camera(tmp_path / "again.yaml").clock == clock
+    write_camera(tmp_path / "again.yaml", dataclasses.replace(read(""), rig_fields=clock))
+    assert read_camera(tmp_path / "again.yaml").rig_fields == clock
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_what_cannot_be_is_refused_with_file_and_field(read, tmp_path, text, wor
 )
 def test_nothing_is_a_number_and_no_mapping(read, text):
     if "time_offset" in text:
-        assert read(text).clock == RigFields()
+        assert read(text).rig_fields == RigFields()
     else:
         with pytest.raises(InputError, match=text.split(":")[0]):
             read(text)
@@ -197,3 +197,9 @@ def test_a_run_begins_with_the_odometer_that_the_file_knows(read):
     np.testing.assert_allclose(prior_bias(settings.slam.motion).mean, [0.02, -0.01, 0.0, 0.002])
     assert RunSettings().on(read("")) == RunSettings()
     assert to_dict(settings)["motion.left_error"] == -0.01
+
+
+def test_an_error_of_the_odometer_that_the_user_sets_stays(read):
+    settings = with_settings(RunSettings(), {"motion.left_error": 0.05}, "here")
+    on = settings.on(read("odometer: {left: 0.02, right: 0.03}\n")).slam.motion
+    assert (on.left_error, on.right_error, on.distance_error) == (0.05, 0.03, 0)

@@ -1,14 +1,14 @@
 """Whether a fit of the rig is an answer, and what it says, in words for a person."""
 
 import enum
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
-from sofjax.calibration.fit import DEFAULT, CalibrationResult, FitConfig
+from sofjax.calibration.fit import DEFAULT, LIMIT, CalibrationResult, FitConfig
 from sofjax.calibration.pairs import MOUNT, TURNS, UNKNOWNS, SegmentPairs
 from sofjax.motion import BIAS
 from sofjax.rig import Rig
@@ -50,7 +50,7 @@ _ODOMETER = (
 )
 # what a mount must be known to, share of the height and radians, to be called so
 GOOD = (0.02, np.radians(0.2))
-ROUGH = (0.05, np.radians(0.5))
+ROUGH = (LIMIT["height"], LIMIT["pitch"])
 
 
 class FitOutcome(enum.Enum):
@@ -88,22 +88,37 @@ def assess(found: CalibrationResult, config: FitConfig, pairs: SegmentPairs) -> 
     count = int(pairs.valid.sum())
     if count < config.min_pairs:
         return Assessment.of(FitOutcome.TOO_FEW_PAIRS, count=count, needed=config.min_pairs)
-    sigma = jnp.sqrt(jnp.diag(found.covariance))
-    wide = [
-        f"the {_SHOWN[name][0]} (known to {_shown(name, float(s))})"
-        for name, s, limit in zip(UNKNOWNS, sigma, config.limit, strict=True)
-        # the errors in turning are always free: nobody asked for them
-        if name in config.free and name not in TURNS and s > limit
-    ]
-    if wide:
-        return Assessment.of(
-            FitOutcome.NOT_OBSERVABLE,
-            unknowns=" and ".join(wide),
-            reason=doubts(found, config) or _HINT,
-        )
+    limit = dict(zip(UNKNOWNS, config.limit, strict=True))
+    # the errors in turning are always free: nobody asked for them
+    asked = {name: limit[name] for name in config.free if name not in TURNS}
+    if wide := _wide(found.covariance, asked):
+        return _not_observable(wide, doubts(found, config))
     if found.result != optx.RESULTS.successful:
         return Assessment.of(FitOutcome.NOT_CONVERGED)
     return Assessment.of(FitOutcome.ANSWER)
+
+
+def too_wide(covariance: Float[np.ndarray, "17 17"], doubt: str) -> Assessment:
+    """That height or angles are known less well than `ROUGH`, and what to drive to mend it."""
+    height, angle = ROUGH
+    limits = dict(zip(MOUNT[:3], (height, angle, angle), strict=True))
+    return _not_observable(_wide(covariance, limits), doubt)
+
+
+def _wide(covariance: Float[ArrayLike, "17 17"], limits: Mapping[str, float]) -> list[str]:
+    """Those of the unknowns that are known less well than their limits, in words."""
+    sigma = dict(zip(UNKNOWNS, np.sqrt(np.diag(np.asarray(covariance))).tolist(), strict=True))
+    return [
+        f"the {_SHOWN[name][0]} (known to {_shown(name, sigma[name])})"
+        for name, limit in limits.items()
+        if sigma[name] > limit
+    ]
+
+
+def _not_observable(wide: list[str], doubt: str) -> Assessment:
+    return Assessment.of(
+        FitOutcome.NOT_OBSERVABLE, unknowns=" and ".join(wide), reason=doubt or _HINT
+    )
 
 
 def ambiguity(ends: Float[np.ndarray, "starts 3"]) -> Assessment:

@@ -1,5 +1,6 @@
 """The rig by least squares over pairs, with its covariance and what the pairs do not show."""
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -26,6 +27,7 @@ from sofjax.calibration.pairs import (
 from sofjax.geometry.camera import Mount
 from sofjax.smoothing.problem import robust
 
+HALF_DEGREE = math.radians(0.5)
 # standard deviations of what is known beforehand of each of UNKNOWNS, in the units of `RIG` and of
 # the odometer's errors, and those from which on an answer is none
 PRIOR = dict(
@@ -34,9 +36,9 @@ PRIOR = dict(
     curvature=0.005,
 )  # fmt: skip
 LIMIT = dict(
-    height=0.05, pitch=0.0088, roll=0.0088, yaw=0.0088, x=0.1, y=0.1, focal=0.01, cx=0.01, cy=0.01,
-    k1=0.02, k2=0.02, time_offset=0.01, line_delay=1e-5, distance=0.05, left=0.1, right=0.1,
-    curvature=0.01,
+    height=0.05, pitch=HALF_DEGREE, roll=HALF_DEGREE, yaw=HALF_DEGREE, x=0.1, y=0.1, focal=0.01,
+    cx=0.01, cy=0.01, k1=0.02, k2=0.02, time_offset=0.01, line_delay=1e-5, distance=0.05,
+    left=0.1, right=0.1, curvature=0.01,
 )  # fmt: skip
 
 

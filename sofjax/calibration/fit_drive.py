@@ -53,7 +53,7 @@ class DriveFitConfig:
     fit: FitConfig = field(
         default_factory=lambda: FitConfig(free=("height", "pitch", "roll", *TURNS))
     )
-    more: tuple[str, ...] = ()  # of UNKNOWNS, free beside those of `fit` where the drive tells them
+    more: tuple[str, ...] = ()  # of UNKNOWNS, free beside those of `fit` if contradicted
     starts: tuple[tuple[float, float], ...] = STARTS  # factor of height, radians added to pitch
     search_rounds: int = 10  # from each start, at most
     settled: float = 0.1  # a search ends with a round that moves by less, in units of `_distance`
@@ -123,8 +123,8 @@ def fit_drive(given: Rig, log: Observation, config: DriveFitConfig | None = None
     Each round associates segments anew and then solves with these associations. The rounds begin
     at the given mount and at four others far from it; the answer is where most of them end. Only
     the last rounds test which lines lie on the floor: by a wrong mount the wrong lines seem to lie
-    there, and the fit would keep that mount. Then all of `config.more` are freed, and those held
-    again that the drive does not tell.
+    there, and the fit would keep that mount. Then those of `config.more` are freed that the drive
+    contradicts as they were given.
 
     **Arguments:**
     - `given`: with a rough mount.
@@ -158,7 +158,8 @@ def _freed(found: DriveFit, log: Observation, config: DriveFitConfig) -> DriveFi
         estimate = Estimate(start.estimate.given, jnp.asarray(by))
         return _round(estimate, log, config, test_floor=True, free=free)
 
-    mount, more = {*config.fit.free}, {*config.more} - {*config.fit.free}
+    mount = {*config.fit.free} - {*TURNS}
+    more = {*config.more} - mount
     kept: set[str] = set()
     while tried := _freed_one_by_one(found, config, more - kept):
         name = max(tried, key=lambda name: tried[name].contradicted)

@@ -153,8 +153,8 @@ def _calibrate_camera(parts: "Commands") -> None:
     )
     _add_out(
         parser,
-        "the camera file; default camera.yaml. The mount that it has already is kept, and a "
-        "figure is drawn beside it. Files that sofjax has not written are not replaced",
+        "the camera file; default camera.yaml. Mount, clock and odometer that it has already are "
+        "kept, and a figure is drawn beside it. Files that sofjax has not written are not replaced",
     )
     parser.add_argument(
         "--mount",

@@ -1,6 +1,7 @@
 """`sofjax calibrate camera`: intrinsics from views of a board."""
 
 import argparse
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -11,6 +12,7 @@ from sofjax.cli.progress import bar
 from sofjax.io.errors import InputError, quoted
 
 if TYPE_CHECKING:
+    from sofjax.io.camera_file import RigFields
     from sofjax.vision.boards import Board
     from sofjax.vision.checkerboard import CameraFit, Verdict
 
@@ -21,7 +23,7 @@ REFUSED = 3  # exit code: all was read, and nothing can be known from it
 def run(args: argparse.Namespace) -> int:
     """Find the corners, fit, judge, print, write, draw."""
     from sofjax import viewer
-    from sofjax.io.camera_file import known_mount, mount_fields
+    from sofjax.io.camera_file import RigFields, known_mount, known_rig_fields, mount_fields
     from sofjax.pipeline import board_images, run_folder
     from sofjax.vision.checkerboard import fit_camera, judge
 
@@ -32,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     run_folder.check_camera(args.out)
     run_folder.check_figure(figure)
     mount = known_mount(args.out) if args.out.exists() else {}
+    fields = known_rig_fields(args.out) if args.out.exists() else RigFields()
     mount |= mount_fields("--mount", args.mount) if args.mount is not None else {}
     files = board_images.files(args.images)
     with bar(len(files), board.things) as progress:
@@ -46,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     board, verdict = found.board, judge(fit)
     print(summary(board, fit, verdict, found.left_out))
     if verdict.usable:
-        _write(args.out, board, fit, mount)
+        _write(args.out, board, fit, mount, fields)
     else:
         print(f"{args.out} is not written")
     if viewer.available():
@@ -110,17 +113,14 @@ def _draw(
     )
 
 
-def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict[str, float]) -> None:
-    """The camera file, and what it still wants."""
+def _write(
+    path: Path, board: "Board", fit: "CameraFit", mount: dict[str, float], fields: "RigFields"
+) -> None:
+    """The camera file, with clock and odometer as they stood in it, and what it still wants."""
     import jax.numpy as jnp
 
     from sofjax.geometry import Camera
-    from sofjax.io.camera_file import (
-        TO_FILL_IN,
-        RigFields,
-        check_floor_in_view,
-        write_intrinsics,
-    )
+    from sofjax.io.camera_file import TO_FILL_IN, check_floor_in_view, write_intrinsics
 
     missing = [key for key in TO_FILL_IN if key not in mount]
     if not missing:
@@ -130,8 +130,8 @@ def _write(path: Path, board: "Board", fit: "CameraFit", mount: dict[str, float]
     notes = [f"from {views} views of a {board} board", *numbers(fit)]
     distortion = fit.distortion.round(7)
     name = path.resolve().parent.name  # as a camera without a name is called
-    known = RigFields(sigma=known_to(fit))
-    write_intrinsics(path, camera, "plumb_bob", distortion, name, mount, notes, known)
+    fields = dataclasses.replace(fields, sigma={**fields.sigma, **known_to(fit)})
+    write_intrinsics(path, camera, "plumb_bob", distortion, name, mount, notes, fields)
     print(f"written to {path}")
     if missing:
         print(f"before a run, fill in the {' and the '.join(missing)} of its mount")

@@ -24,7 +24,7 @@ TO_FILL_IN = {  # placeholders in a new file for what only the user knows
     "height": "fill in the metres from the floor to the lens",
     "pitch": "fill in the radians that the camera looks down",
 }
-NO_CLOCK = RigFields()
+PLAIN = RigFields()  # a clock that agrees, an odometer that is right
 ROUNDING = 1e-3  # radians: an angle rounded to three digits may exceed its limit by this
 FIRST_LINE = (  # of every camera file that is written here
     "# camera_info, with the mount of the camera on the robot: metres, radians, "
@@ -42,7 +42,7 @@ class CameraFile:
     distortion_model: str  # plumb_bob, rational_polynomial or equidistant
     name: str
     remarks: tuple[str, ...] = ()  # sentences on what the file does not say
-    clock: RigFields = NO_CLOCK  # clock, shutter and odometer
+    rig_fields: RigFields = PLAIN  # clock, shutter and odometer
 
     @property
     def rig(self) -> Rig:
@@ -51,7 +51,7 @@ class CameraFile:
         number = lambda value: jnp.asarray(value, float)
         return Rig(
             self.camera, self.mount, Lens.of(self.distortion, fisheye),
-            number(self.clock.time_offset), number(self.clock.line_delay),
+            number(self.rig_fields.time_offset), number(self.rig_fields.line_delay),
         )  # fmt: skip
 
 
@@ -76,7 +76,7 @@ def read_camera(path: Path) -> CameraFile:
         distortion_model=model,
         name=path.parent.name if name is None else str(name),
         remarks=tuple(remarks),
-        clock=read_rig_fields(path, fields),
+        rig_fields=read_rig_fields(path, fields),
     )
 
 
@@ -90,7 +90,7 @@ def write_camera(path: Path, camera_file: CameraFile) -> None:
         camera_file.distortion,
         camera_file.name,
         {key: getattr(mount, key) for key in MOUNT_FIELDS},
-        clock=camera_file.clock,
+        rig_fields=camera_file.rig_fields,
     )
 
 
@@ -102,7 +102,7 @@ def write_intrinsics(
     name: str,
     mount: Mapping[str, SupportsFloat],
     notes: Sequence[str] = (),
-    clock: RigFields = NO_CLOCK,
+    rig_fields: RigFields = PLAIN,
 ) -> None:
     """Write a camera file; only some fields of its mount need be known.
 
@@ -112,7 +112,7 @@ def write_intrinsics(
     **Arguments:**
     - `mount`: metres and radians by the names of `Mount`'s fields.
     - `notes`: lines to stand as comments at the top.
-    - `clock`: of which only what is not zero is written.
+    - `rig_fields`: of which only what is not zero is written.
     """
     mount = {**mount, **_canonical({key: mount[key] for key in ANGLES if key in mount})}
     placed = ", ".join(
@@ -134,7 +134,7 @@ def write_intrinsics(
         f"distortion_model: {distortion_model}\n"
         f"distortion_coefficients: {{rows: 1, cols: {len(distortion)}, data: [{data}]}}\n"
         f"mount: {{{placed}}}\n"
-        f"{rig_lines(clock)}",
+        f"{rig_lines(rig_fields)}",
     )
 
 
@@ -155,6 +155,11 @@ def known_mount(path: Path) -> dict[str, float]:
     """The fields of the mount in a camera file that are filled in; none if there is no mount."""
     mount = mapping(f"{path}: 'mount'", camera_fields(path).get("mount", {}))
     return _mount_numbers(f"{path}: 'mount'", mount)
+
+
+def known_rig_fields(path: Path) -> RigFields:
+    """Clock, shutter and odometer of a camera file, whatever else is missing in it."""
+    return read_rig_fields(path, camera_fields(path))
 
 
 def doubts(camera_file: CameraFile) -> list[str]:

@@ -48,7 +48,7 @@ class Drive:
     @property
     def odometer_stamps(self) -> np.ndarray:
         """[T] The stamps of the images by the odometer's clock, seconds."""
-        return self.image_stamps + self.camera_file.clock.time_offset
+        return self.image_stamps + self.camera_file.rig_fields.time_offset
 
     @property
     def odometry_at_images(self) -> Trajectory:
@@ -75,7 +75,7 @@ def read_drive(path: Path) -> Drive:
     if nanoseconds:
         remarks.append("the timestamps are nanoseconds, and were read as such")
     span = read.trajectory.span()
-    stamps_odometer = stamps + camera_file.clock.time_offset
+    stamps_odometer = stamps + camera_file.rig_fields.time_offset
     if outside(read.trajectory, stamps_odometer).all():
         raise InputError(
             f"{path}: the images ({stamps[0]:.3f} to {stamps[-1]:.3f} s) and the odometry "

@@ -1,6 +1,5 @@
 """What a camera file says beside lens and mount: clock, shutter, odometer, and how well known."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,6 +89,4 @@ def _numbers(path: Path, fields: Mapping, key: str, names: tuple[str, ...]) -> d
             raise InputError(
                 f"{where} has no field {quoted(str(name))}; {nearest(str(name), names)}"
             )
-    found = {name: number(f"{where}: '{name}'", value) for name, value in given.items()}
-    assert all(map(math.isfinite, found.values()))
-    return found
+    return {name: number(f"{where}: '{name}'", value) for name, value in given.items()}

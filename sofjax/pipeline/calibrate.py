@@ -21,7 +21,7 @@ from sofjax.calibration import (
     FitConfig,
     fit_drive,
 )
-from sofjax.calibration.assessment import accuracy, doubts, estimates, grade
+from sofjax.calibration.assessment import accuracy, doubts, estimates, grade, too_wide
 from sofjax.calibration.joint import fit_jointly
 from sofjax.extraction.observation import Observation
 from sofjax.geometry import Camera
@@ -42,7 +42,7 @@ IF_TOLD = tuple(name for name in RIG if name not in (*BY_DEFAULT, "line_delay"))
 STANDS_STILL = 0.05  # metres and radians, below which a drive tells nothing of a rig
 FRONTEND = FrontendSettings(capacity=256)  # a fit is sure by many lines, of which a run needs few
 STEP = 32  # capacities are multiples of it
-COMPARED = 4e6  # pairs of segments of two images, of the whole drive: more make no fit surer
+COMPARED = 4e6  # pairs of segments of successive images, of a whole drive: what a fit has time for
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Calibration:
         notes = [f"calibrated on {self.drive.name}, {self.evidence}", *self.estimates]
         write_intrinsics(
             path, file.camera, file.distortion_model, file.distortion, file.name,
-            {key: getattr(file.mount, key) for key in MOUNT_FIELDS}, notes, file.clock,
+            {key: getattr(file.mount, key) for key in MOUNT_FIELDS}, notes, file.rig_fields,
         )  # fmt: skip
 
 
@@ -151,7 +151,10 @@ def calibrate_drive(
     evidence = f"{len(residuals)} of {found.related} pairs of segments taken for floor"
     evidence += ", then jointly with poses and lines" * (usable and joint)
     known = accuracy(covariance) + f"; {doubt}" * bool(doubt)
-    verdict = FitVerdict.DOUBTFUL if doubt else FitVerdict(grade(covariance))
+    verdict = FitVerdict(grade(covariance))
+    if usable and verdict == FitVerdict.NOT_USABLE:
+        assessment, usable = too_wide(covariance, doubt), False
+    verdict = FitVerdict.DOUBTFUL if doubt else verdict
     odometer = np.asarray(found.fit.odometer)
     return Calibration(
         drive=drive,
@@ -179,7 +182,7 @@ def _narrowed(log: Observation) -> Observation:
 def _config(file: CameraFile, free: tuple[str, ...], more: tuple[str, ...]) -> DriveFitConfig:
     """What is known beforehand is what the file says of it."""
     usual = FitConfig().prior_sigma
-    known = [file.clock.sigma.get(name, sigma) if name in INTRINSICS else sigma
+    known = [file.rig_fields.sigma.get(name, sigma) if name in INTRINSICS else sigma
              for name, sigma in zip(UNKNOWNS, usual, strict=True)]  # fmt: skip
     # the odometer's turning errs more than anything; its distance is the measure of the height
     fit = FitConfig(
@@ -197,7 +200,7 @@ def _fitted_file(
     moved = {UNKNOWNS[i] for i in np.flatnonzero(np.asarray(found.estimate.by))}
     number = lambda value: jnp.asarray(value, float)
     mount = jax.tree.map(number, rig.mount)
-    camera, distortion, clock = file.camera, file.distortion, file.clock
+    camera, distortion, fields = file.camera, file.distortion, file.rig_fields
     if moved & {"focal", "cx", "cy"}:
         camera = Camera(number(rig.camera.K), camera.width, camera.height)
     if moved & {"k1", "k2"}:
@@ -205,13 +208,16 @@ def _fitted_file(
         distortion = np.pad(distortion, (0, max(0, 2 - len(distortion))))
         distortion = distortion + np.pad(by[:2], (0, len(distortion) - 2))
     for name in moved & {"time_offset", "line_delay"}:
-        clock = dataclasses.replace(clock, **{name: _short(getattr(rig, name))})
+        fields = dataclasses.replace(fields, **{name: _short(getattr(rig, name))})
     if robot:
         sigma = dict(zip(UNKNOWNS, map(_short, np.sqrt(np.diag(covariance))), strict=True))
         known = {name: value for name, value in sigma.items() if value}
         odometer = tuple(map(_short, found.fit.odometer))
-        clock = RigFields(clock.time_offset, clock.line_delay, odometer, {**clock.sigma, **known})
-    return dataclasses.replace(file, camera=camera, mount=mount, distortion=distortion, clock=clock)
+        known = {**fields.sigma, **known}
+        fields = RigFields(fields.time_offset, fields.line_delay, odometer, known)
+    return dataclasses.replace(
+        file, camera=camera, mount=mount, distortion=distortion, rig_fields=fields
+    )
 
 
 def _short(value: SupportsFloat) -> float:

@@ -62,11 +62,13 @@ class RunSettings:
         return with_settings(self, {"segment_map.recall": RECALL}, "loop")
 
     def on(self, camera_file: CameraFile) -> "RunSettings":
-        """The settings with what the robot's file knows of its odometer as their prior."""
-        if not any(camera_file.clock.odometer):
-            return self
-        bias = zip(MEANS, camera_file.clock.odometer, strict=True)
-        known = {f"motion.{name}": value for name, value in bias}
+        """The settings with what the robot's file knows of its odometer as their prior.
+
+        What the user has set stays.
+        """
+        bias = zip(MEANS, camera_file.rig_fields.odometer, strict=True)
+        unset = {name for name in MEANS if not getattr(self.slam.motion, name)}
+        known = {f"motion.{name}": value for name, value in bias if name in unset and value}
         return with_settings(self, known, "camera.yaml")
 
 

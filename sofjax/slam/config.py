@@ -78,8 +78,8 @@ class SlamConfig(eqx.Module):
         they are so already.
 
         A length is so many camera heights: a robot half as high sees the same images half as far
-        away. Ranges besides grow with what a pixel tells: at (r² + 1) / f heights a pixel they end
-        for any lens.
+        away. At a range of r heights a pixel is (r² + 1) / f heights of floor: a range is where
+        that is as much as with a focal length f of `RESOLVING` at the range of the settings.
         """
         if self.lengths == "metres":
             return self

@@ -23,7 +23,7 @@ SURE = 3.0  # standard deviations by which more segments move as read than by ch
 KEPT = 0.9  # of the counts, from image to image: a memory of ten images
 CONTRADICTED = 0.1  # of the segments: so many more stand still than move as read
 AGREED = 0.03  # the same, below which an image agrees again
-FEW = 36.0  # segments compared, with fewer of which nothing can be told
+FEW = 36.0  # segments compared: fewer tell nothing
 TURNED = 0.1  # radians between the two views; straight on, other drives look alike
 
 
@@ -44,7 +44,7 @@ def consistency(
     told = as_read - by_chance > SURE * jnp.sqrt(as_read + by_chance)
     contradiction = (still - as_read) / jnp.maximum(seen, 1)
     agrees = told & (contradiction < jnp.where(before.trusted, CONTRADICTED, AGREED))
-    agrees = agrees | (seen < FEW)  # nor does an odometer that has read nothing contradict
+    agrees = agrees | (seen < FEW)  # until some are compared, nothing is contradicted
     wait = jnp.where(agrees, jnp.maximum(before.wait - 1, 0), before.wait)
     trusted = agrees & (wait == 0)
     given_up = before.trusted & ~trusted

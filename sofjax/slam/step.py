@@ -31,7 +31,8 @@ def one_round(
     local = local_map(setup, state.segment_map, extracted.measurements, predicted.T_world_robot)
     weighted = reweight(setup, predicted, extracted, local)
     chosen = choose(setup, predicted, extracted, local, weighted, key_choice)
-    extracted = through_unread(state, predicted, extracted, chosen.T_world_robot)
+    if setup.config.filter.doubting:
+        extracted = through_unread(state, predicted, extracted, chosen.T_world_robot)
     # 6) integrate the observed segments into the map, as seen from the chosen pose
     updated = update_map(setup, state.segment_map, extracted, local, chosen)
     # 7) the next round starts from here

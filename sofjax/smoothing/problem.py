@@ -175,5 +175,5 @@ def residuals(unknowns: Unknowns, problem: Problem) -> Residuals:
         odometer=jnp.concatenate([first, odometer]),
         tilt=unknowns.pose[:, 3:] / jnp.maximum(priors.tilt_sigma, FIXED),
         line=(unknowns.line - centre) / line_sigma,
-        shared=(unknowns.shared.at[4:].add(-bias.mean)) / jnp.maximum(shared_sigma, FIXED),
+        shared=unknowns.shared.at[4:].add(-bias.mean) / jnp.maximum(shared_sigma, FIXED),
     )

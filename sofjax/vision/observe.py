@@ -47,7 +47,7 @@ def observations(
     rig = drive.camera_file.rig
     for i, view in enumerate(without_repeats(views, steps)):
         observed = observation(view, steps[i], None if sigmas is None else sigmas[i], around[i])
-        if drive.camera_file.clock.line_delay:
+        if drive.camera_file.rig_fields.line_delay:
             observed = _all_rows_at_once(rig, observed)
         yield view, observed
 
